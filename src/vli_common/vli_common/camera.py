@@ -57,6 +57,25 @@ class CameraModel(ABC):
         """Return rays (N, 2) of raw pixels (N, 2)."""
         return self.undistort((np.asarray(pixels, dtype=np.float64) - [self.cx, self.cy]) / [self.fx, self.fy])
 
+    def pixel_grid(self, steps: int = 25) -> FloatArray:
+        """Return pixels (steps², 2) spread evenly over the image, edges and corners included."""
+        u, v = np.linspace(-0.5, self.width - 0.5, steps), np.linspace(-0.5, self.height - 0.5, steps)
+        return np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+
+    def is_invertible(self) -> bool:
+        """Return True where every pixel of the image has one ray: the distortion never folds between it and the centre."""
+        pixels = self.pixel_grid()
+        with np.errstate(all="ignore"):
+            rays = self.unproject(pixels)
+            residual = np.abs(self.to_pixels(rays) - pixels).max()
+            # Newton may land beyond a fold, where the round trip closes too; hence the walk from the centre.
+            walk = (np.linspace(0.02, 1.0, 50)[:, None, None] * rays).reshape(-1, 2)
+            step = 1e-6
+            along_x = (self.distort(walk + [step, 0]) - self.distort(walk - [step, 0])) / (2 * step)
+            along_y = (self.distort(walk + [0, step]) - self.distort(walk - [0, step])) / (2 * step)
+            determinant = along_x[:, 0] * along_y[:, 1] - along_x[:, 1] * along_y[:, 0]
+        return bool(np.isfinite(residual) and residual < 1e-6 and (determinant > 0).all())
+
     @property
     def focal_px(self) -> float:
         """Geometric mean of fx and fy."""
