@@ -1,0 +1,1 @@
+"""From sensor or bag to triangulated stripes: sources, demultiplexer, stripe detector, triangulation."""
