@@ -1,0 +1,62 @@
+# `make demo` and `make test` do everything from a fresh clone. PYTHON picks the interpreter (CPython 3.11 or 3.12).
+
+SUPPORTED := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 12))
+PYTHON ?= $(shell for p in python3.12 python3.11 python3 python; do $$p -c '$(SUPPORTED)' 2>/dev/null && { echo $$p; break; }; done)
+VENV ?= .venv
+NUMPY1_VENV := .venv-numpy1
+PACKAGES := $(patsubst %/setup.py,%,$(wildcard src/*/setup.py))
+BUILD_FILES := $(wildcard src/*/setup.py src/*/setup.cfg src/*/pyproject.toml)
+INSTALL := -m pip install --quiet --disable-pip-version-check
+BIN := $(VENV)/bin
+# Tests start ROS graphs of their own: they must not meet those of others on the network.
+export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
+
+.PHONY: demo test test-all lint format bench venv config lock clean
+
+demo: venv
+	$(BIN)/vli demo
+
+venv: $(VENV)/.installed
+
+$(VENV)/.installed: requirements.txt requirements-dev.txt requirements.lock $(BUILD_FILES)
+	@test -n "$(PYTHON)" || { echo "no CPython 3.11 or 3.12 found; name one: make venv PYTHON=/path/to/python3.12" >&2; exit 2; }
+	@echo "installing into $(VENV) (about two minutes)" >&2
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python $(INSTALL) -r requirements.txt -r requirements-dev.txt -c requirements.lock
+	$(BIN)/python $(INSTALL) --no-build-isolation $(addprefix -e ,$(PACKAGES)) -c requirements.lock
+	$(BIN)/python -m vli_bringup.warm_up
+	@touch $@
+
+test: lint
+	$(BIN)/python -m pytest -m "not slow"
+
+test-all: lint $(NUMPY1_VENV)/.installed
+	$(BIN)/python -m pytest
+	$(NUMPY1_VENV)/bin/python -m pytest -m "not slow and not lint"
+
+$(NUMPY1_VENV)/.installed: requirements-numpy1.lock $(BUILD_FILES)
+	$(PYTHON) -m venv $(NUMPY1_VENV)
+	$(NUMPY1_VENV)/bin/python $(INSTALL) -r requirements-numpy1.lock
+	$(NUMPY1_VENV)/bin/python $(INSTALL) --no-build-isolation --no-deps $(addprefix -e ,$(PACKAGES))
+	@touch $@
+
+lint: venv
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: venv
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: venv
+	$(BIN)/python -m pytest -m perf test/perf
+
+config: venv
+	$(BIN)/python -m vli_bringup.settings > config/vli.yaml
+
+lock:
+	$(PYTHON) .ci/lock.py
+
+clean:
+	rm -rf $(VENV) $(NUMPY1_VENV) build install log

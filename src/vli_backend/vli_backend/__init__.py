@@ -1,0 +1,1 @@
+"""Initialisation and fixed-lag smoother; see docs/architecture.md."""

@@ -1,0 +1,1 @@
+"""The vli command: offline pipeline, replay, evaluation and demo; see docs/architecture.md."""

@@ -1,0 +1,1 @@
+"""Feature tracks, keyframes and IMU preintegration; see docs/architecture.md."""

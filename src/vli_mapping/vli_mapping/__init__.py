@@ -1,0 +1,1 @@
+"""Coloured point map and window-to-map association; see docs/architecture.md."""
