@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -10,9 +11,15 @@ REPOSITORY = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture(scope="session")
+def repository() -> Path:
+    """Return the root of the workspace."""
+    return REPOSITORY
+
+
+@pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """Return the directory of recordings beside the repository; tests that need them are skipped where it is absent."""
-    path = REPOSITORY.parent / "shared" / "data"
+    """Return the directory of recordings: ``$VLI_SHARED/data``, by default ``../shared/data``; skip where it is absent."""
+    path = Path(os.environ.get("VLI_SHARED", REPOSITORY.parent / "shared")) / "data"
     if not path.is_dir():
-        pytest.skip(f"needs the recordings in '{path}'")
+        pytest.skip(f"needs the recordings in '{path}'; set VLI_SHARED to the directory that holds 'data'")
     return path
