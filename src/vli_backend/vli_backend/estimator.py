@@ -1,0 +1,357 @@
+"""The sliding window at work: frame poses between keyframes, the smoother at keyframes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import cast
+
+import gtsam
+import numpy as np
+
+from vli_backend.condense import Quadratic, condense, refine
+from vli_backend.config import BackEndConfig
+from vli_backend.frame_pose import FramePose, solve_frame_pose
+from vli_backend.landmarks import LandmarkTable
+from vli_backend.laser_depth import laser_depths
+from vli_backend.map_residuals import condense_map
+from vli_backend.smoother import Condenser, GtsamSmoother, KeyframeState, Smoother, SmootherError, StatePrior
+from vli_backend.window import FrameRecord, Interval, Window, close_interval
+from vli_common.arrays import BoolArray, FloatArray, IntArray
+from vli_common.calibration import Calibration
+from vli_common.geometry import inverse, so3_exp, so3_log
+from vli_common.types import (
+    FrontEndOutput,
+    ImuBias,
+    LaserScan,
+    MapConstraints,
+    PoseEstimate,
+    Preintegration,
+    TrackFlag,
+    Tracks,
+    WindowPoses,
+)
+
+_DEPTH_REFERENCE_M = 0.03
+"""Distance at which ``depth_sigma`` holds; a triangulated depth's error grows with z²."""
+
+
+@dataclass(frozen=True)
+class FrameResult:
+    """Live pose of a frame; at a keyframe also the window and the bias; number of landmarks that fit."""
+
+    pose: PoseEstimate | None
+    landmarks: int
+    window: WindowPoses | None = None
+    bias: ImuBias | None = None
+
+
+@dataclass(frozen=True)
+class LandmarkPoints:
+    """Landmarks as points for PnP: ids (N,), positions (N, 3) in map, one sigma along the anchor's ray (N, 3) in map."""
+
+    ids: IntArray
+    positions: FloatArray
+    spread: FloatArray
+
+
+class WindowEstimator:
+    """Poses, velocities and biases of the newest keyframes, and the pose of every frame since.
+
+    Args:
+        calibration: camera, IMU, laser.
+        config: parameters.
+        first: tracks of the first keyframe.
+        state: its state.
+        prior: how well that is known.
+        scans: stripes seen so far.
+    """
+
+    def __init__(
+        self, calibration: Calibration, config: BackEndConfig, first: Tracks, state: KeyframeState, prior: StatePrior, scans: list[LaserScan]
+    ) -> None:
+        self._config = config
+        self._focal_px = calibration.camera.focal_px
+        self._T_cam_imu = calibration.T_cam_imu if calibration.T_cam_imu is not None else np.eye(4)
+        self._T_imu_cam = inverse(self._T_cam_imu)
+        self._limits = _inverse_depth_limits(calibration)
+        self._smoother: Smoother = GtsamSmoother(config.window_keyframes)
+        self._landmarks = LandmarkTable(config.window_keyframes + 1)
+        self._window = Window()
+        self._scans = list(scans)
+        self._restarted: set[int] = set()
+        self._moving_keyframes = 0
+        self._T_map_odom = np.eye(4)
+        self.constraints: MapConstraints | None = None
+        self.plausible = True
+
+        self._smoother.start(state, prior)
+        self._state = state
+        self._window.append(first.stamp_ns, first.stationary, None)
+        self._add_observations(first)
+        self._records = [FrameRecord(first.stamp_ns, state.T_map_imu @ self._T_imu_cam, first.stationary)]
+        self._previous = self._records[0]
+        self._measure_depths()
+        self._points = self._landmark_points(self._keyframe_poses())
+
+    @property
+    def last_pose(self) -> FloatArray:
+        """``T_map_imu`` (4, 4) of the newest frame."""
+        result: FloatArray = self._records[-1].T_map_camera @ self._T_cam_imu
+        return result
+
+    def recent_keyframes(self, count: int) -> list[int]:
+        """Return the stamps of the newest ``count`` keyframes."""
+        return self._window.stamps[-count:]
+
+    def add_scan(self, scan: LaserScan) -> None:
+        """Keep a stripe until its keyframe interval closes."""
+        self._scans.append(scan)
+
+    def current(self, stamp_ns: int, session: int) -> FrameResult:
+        """Return the newest state as the result of a frame that has just started the window."""
+        covariance = np.diag([1e-8] * 6)
+        pose = self._estimate(stamp_ns, self._records[-1].T_map_camera, self._state.velocity, np.zeros(3), covariance, session)
+        return FrameResult(pose, len(self._points.ids), self._window.poses(self._keyframe_poses(), 0, session), self._bias(session))
+
+    def add_frame(self, frame: FrontEndOutput, session: int) -> FrameResult:
+        """Return the pose of one long frame; at a keyframe, solve the window."""
+        tracks, imu = frame.tracks, self._usable(frame.preintegration)
+        predicted, velocity = self._predict(tracks.stamp_ns, imu)
+        found = self._frame_pose(tracks, predicted, imu is not None, tracks.stamp_ns - self._window.stamps[-1])
+        self._restarted.update(int(i) for i in tracks.ids[(tracks.flags & TrackFlag.TEMPLATE) > 0])
+        self._records.append(FrameRecord(tracks.stamp_ns, found.T_map_camera, tracks.stationary))
+        if not tracks.keyframe:
+            covariance = self._covariance(found)
+            rate = self._angular_rate()
+            self._previous = self._records[-1]
+            pose = self._estimate(tracks.stamp_ns, found.T_map_camera, velocity, rate, covariance, session)
+            return FrameResult(pose, found.inliers)
+        return self._add_keyframe(tracks, imu, found, velocity, session)
+
+    def add_start_keyframe(self, tracks: Tracks, state: KeyframeState, imu: gtsam.PreintegratedCombinedMeasurements | None) -> None:
+        """Append a keyframe whose state a start in motion has found; :meth:`finish_start` solves them together."""
+        self._records.append(FrameRecord(tracks.stamp_ns, state.T_map_imu @ self._T_imu_cam, tracks.stationary))
+        self._append_keyframe(tracks, state, imu)
+        self._state = state
+
+    def finish_start(self) -> None:
+        """Solve the window of a start in motion."""
+        self._solve(self._config.start_iterations)
+
+    def flush(self, session: int) -> WindowPoses | None:
+        """Return all frames as final, those after the newest keyframe included."""
+        poses = self._keyframe_poses()
+        if len(self._records) > 1:
+            interval = close_interval(self._records, self._scans)
+            last = self._records[-1]
+            self._window.append(last.stamp_ns, last.stationary, interval)
+            poses = np.concatenate([poses, last.T_map_camera[None]])
+        return self._window.poses(poses, len(self._window), session)
+
+    # -- one frame ---------------------------------------------------------------------------------------------------------
+
+    def _usable(self, preintegration: Preintegration | None) -> gtsam.PreintegratedCombinedMeasurements | None:
+        """Return the GTSAM object if it starts at the newest keyframe."""
+        if preintegration is None or preintegration.from_ns != self._window.stamps[-1]:
+            return None
+        return cast(gtsam.PreintegratedCombinedMeasurements, preintegration.measurements)
+
+    def _predict(self, stamp_ns: int, imu: gtsam.PreintegratedCombinedMeasurements | None) -> tuple[FloatArray, FloatArray]:
+        """Return ``T_map_camera`` and velocity from the IMU, or from constant velocity where it is missing."""
+        if imu is not None:
+            nav = imu.predict(self._state.nav_state(), self._state.bias())
+            return nav.pose().matrix() @ self._T_imu_cam, nav.velocity()
+        last, before = self._records[-1], self._previous
+        if last.stamp_ns == before.stamp_ns:
+            return last.T_map_camera, self._state.velocity
+        ahead = (stamp_ns - last.stamp_ns) / (last.stamp_ns - before.stamp_ns)
+        step = inverse(before.T_map_camera) @ last.T_map_camera
+        predicted = last.T_map_camera.copy()
+        predicted[:3, 3] += ahead * (last.T_map_camera[:3, 3] - before.T_map_camera[:3, 3])
+        predicted[:3, :3] = predicted[:3, :3] @ so3_exp(min(ahead, 3.0) * so3_log(step[:3, :3]))
+        return predicted, (last.T_map_camera[:3, 3] - before.T_map_camera[:3, 3]) / ((last.stamp_ns - before.stamp_ns) * 1e-9)
+
+    def _frame_pose(self, tracks: Tracks, predicted: FloatArray, with_imu: bool, elapsed_ns: int) -> FramePose:
+        _, rows, columns = np.intersect1d(self._points.ids, tracks.ids, assume_unique=True, return_indices=True)
+        elapsed = elapsed_ns * 1e-9
+        rotation, position = (5e-4 + 2e-3 * elapsed, 2e-4 + 1e-2 * elapsed) if with_imu else (0.05, 0.01)
+        prior = np.diag(np.repeat([rotation**-2, position**-2], 3))
+        return solve_frame_pose(
+            predicted, prior, self._points.positions[rows], self._points.spread[rows], tracks.rays[columns],
+            self._ray_sigma(tracks)[columns], self._config.cauchy,
+        )  # fmt: skip
+
+    def _ray_sigma(self, tracks: Tracks) -> FloatArray:
+        result: FloatArray = np.hypot(tracks.sigma_px, self._config.pixel_sigma) / self._focal_px
+        return result
+
+    def _angular_rate(self) -> FloatArray:
+        """Return the angular velocity (3,) of imu_link from the last two frames."""
+        last, before = self._records[-1], self._previous
+        turn = so3_log(before.T_map_camera[:3, :3].T @ last.T_map_camera[:3, :3])
+        result: FloatArray = self._T_imu_cam[:3, :3] @ turn / max((last.stamp_ns - before.stamp_ns) * 1e-9, 1e-6)
+        return result
+
+    # -- one keyframe ------------------------------------------------------------------------------------------------------
+
+    def _add_keyframe(
+        self, tracks: Tracks, imu: gtsam.PreintegratedCombinedMeasurements | None, found: FramePose, velocity: FloatArray, session: int
+    ) -> FrameResult:
+        rate = self._angular_rate()
+        T_odom_imu = inverse(self._T_map_odom) @ found.T_map_camera @ self._T_cam_imu
+        state = KeyframeState(found.T_map_camera @ self._T_cam_imu, velocity, self._state.gyro_bias, self._state.accel_bias)
+        self._append_keyframe(tracks, state, imu)
+        moving = not tracks.stationary
+        self._moving_keyframes += int(moving)
+        first_ones = moving and self._moving_keyframes <= self._config.start_keyframes
+        self._solve(self._config.start_iterations if first_ones else self._config.iterations)
+        self._previous = self._records[-2] if len(self._records) > 1 else self._records[-1]
+        T = self._state.T_map_imu
+        self._records = [FrameRecord(tracks.stamp_ns, T @ self._T_imu_cam, tracks.stationary)]
+        self._T_map_odom = T @ inverse(T_odom_imu)
+        pose = self._estimate(tracks.stamp_ns, self._records[0].T_map_camera, self._state.velocity, rate, self._covariance(found), session)
+        window = self._leave(session)
+        return FrameResult(pose, found.inliers, window, self._bias(session))
+
+    def _append_keyframe(self, tracks: Tracks, state: KeyframeState, imu: gtsam.PreintegratedCombinedMeasurements | None) -> None:
+        elapsed_s = (tracks.stamp_ns - self._window.stamps[-1]) * 1e-9
+        self._window.append(tracks.stamp_ns, tracks.stationary, close_interval(self._records, self._scans))
+        self._scans = [scan for scan in self._scans if scan.stamp_ns > tracks.stamp_ns]
+        self._smoother.add_keyframe(state, imu, elapsed_s)
+        self._add_observations(tracks)
+        self._records = self._records[-1:]
+
+    def _add_observations(self, tracks: Tracks) -> None:
+        self._landmarks.forget_lost(tracks.ids)
+        restarted = np.isin(tracks.ids, np.fromiter(self._restarted, np.int64, len(self._restarted)))
+        self._landmarks.add_keyframe(tracks.ids, tracks.rays, self._ray_sigma(tracks), restarted, self._depth_guess())
+        self._restarted.clear()
+
+    def _depth_guess(self) -> float:
+        """Return the inverse depth of a new landmark: the median of the newest scan, else of the landmarks, else mid-range."""
+        scan = self._scans[-1] if self._scans else None
+        if scan is None:
+            found = [list(i.scans.values())[-1] for i in self._window.intervals if i.scans]
+            scan = found[-1] if found else None
+        if scan is not None and len(scan):
+            return float(1.0 / np.median(scan.points[:, 2]))
+        known = self._landmarks.arrays.rho[self._landmarks.usable]
+        return float(np.median(known)) if len(known) >= 5 else float(np.sqrt(self._limits[0] * self._limits[1]))
+
+    def _solve(self, iterations: int) -> None:
+        """Find depths, then poses, velocities and biases of the window."""
+        self._measure_depths()
+        self._smoother.solve(self._condenser(self._landmarks.usable, with_map=True), iterations)
+        self.constraints = None
+        self._state = self._smoother.states()[-1]
+        if not np.isfinite(self._state.T_map_imu).all():
+            raise SmootherError("the solution is not finite")
+        poses = self._keyframe_poses()
+        self._refine(poses, np.ones(len(self._landmarks), np.bool_))
+        self._points = self._landmark_points(poses)
+
+    def _condenser(self, use: BoolArray, with_map: bool) -> Condenser:
+        def linearise(T_map_imu: FloatArray) -> Quadratic:
+            poses = T_map_imu @ self._T_imu_cam
+            self._refine(poses, use)
+            quadratic = condense(self._landmarks.arrays, poses, use, self._config.cauchy)
+            if with_map and self.constraints is not None and len(self.constraints):
+                quadratic = quadratic + condense_map(
+                    self.constraints, self._window.stamps, self._window.intervals, poses, self._config.map_sigma_scale, self._config.map_cauchy
+                )  # fmt: skip
+            return quadratic.in_body_frame(self._T_cam_imu)
+
+        return linearise
+
+    def _refine(self, poses: FloatArray, use: BoolArray) -> None:
+        information = refine(self._landmarks.arrays, poses, use, self._config.cauchy, self._limits)
+        self._landmarks.information[use] = information[use]
+
+    def _leave(self, session: int) -> WindowPoses:
+        """Marginalise the oldest keyframe if the window is full; return the poses of all frames."""
+        poses = self._keyframe_poses()
+        full = len(self._window) > self._config.window_keyframes
+        message = self._window.poses(poses, int(full), session)
+        if full:
+            leaving = self._landmarks.split()
+            stays = self._landmarks.usable & ~leaving
+            self._smoother.marginalise_oldest(self._condenser(self._landmarks.usable & leaving, False), self._condenser(stays, False))
+            self._landmarks.drop_oldest(leaving)
+            self._window.drop_oldest()
+            self._points = self._landmark_points(self._keyframe_poses())
+        return message
+
+    def _measure_depths(self) -> None:
+        """Give the features of the two newest keyframes their laser depth, eq. (2): the newest lacks the scans after it."""
+        poses = self._keyframe_poses()
+        for slot in range(max(0, len(self._window) - 2), len(self._window)):
+            stripes = self._window.near_scans(slot, poses, round(self._config.depth_window_s * 1e9))
+            if slot == len(self._window) - 1 and not stripes and self._scans:
+                stripes = [(poses[slot], self._scans[-1])] if len(self._window) == 1 else []
+            if stripes:
+                self._measure_slot(slot, poses[slot], stripes)
+
+    def _measure_slot(self, slot: int, T_map_camera: FloatArray, stripes: list[tuple[FloatArray, LaserScan]]) -> None:
+        back = inverse(T_map_camera)
+        registered = [scan.points @ (T := back @ pose)[:3, :3].T + T[:3, 3] for pose, scan in stripes]
+        points = np.concatenate(registered)
+        sigma = np.concatenate([scan.sigma for _, scan in stripes])
+        table = self._landmarks
+        rows = np.flatnonzero(table.arrays.sigma[:, slot] > 0)
+        config = self._config
+        found = laser_depths(
+            table.arrays.rays[rows, slot], points, sigma, self._focal_px, config.depth_radius_px, config.depth_min_points, config.depth_max_rms
+        )
+        good = np.isfinite(found.inverse_depth)
+        # A constant error in pixels is one constant in inverse depth: σ(1/z) = σ_z / z², with σ_z ∝ z².
+        floor = config.depth_sigma / _DEPTH_REFERENCE_M**2
+        table.set_depths(
+            slot, rows[good], found.inverse_depth[good], np.hypot(found.sigma[good], floor), found.stripe_px[good], config.primary_only
+        )
+
+    # -- views -------------------------------------------------------------------------------------------------------------
+
+    def _keyframe_poses(self) -> FloatArray:
+        """Return ``T_map_camera`` (K, 4, 4) of the window."""
+        result: FloatArray = np.stack([state.T_map_imu for state in self._smoother.states()]) @ self._T_imu_cam
+        return result
+
+    def _landmark_points(self, poses: FloatArray) -> LandmarkPoints:
+        table = self._landmarks
+        rows = np.flatnonzero(table.active)
+        arrays = table.arrays
+        anchors = poses[arrays.anchor[rows]]
+        rays = np.concatenate([arrays.anchor_ray[rows], np.ones((len(rows), 1))], axis=1)
+        rho = arrays.rho[rows]
+        information = np.maximum(table.information[rows], arrays.prior[rows, 1] ** -2)
+        directions = np.einsum("nij,nj->ni", anchors[:, :3, :3], rays) / rho[:, None]
+        spread = directions * (information**-0.5 / rho)[:, None]
+        ids = table.ids[rows]
+        return LandmarkPoints(ids, directions + anchors[:, :3, 3], spread)
+
+    def _covariance(self, found: FramePose) -> FloatArray:
+        """Return the (6, 6) covariance in ROS order from that of the frame in the camera."""
+        camera = np.linalg.inv(found.information)
+        rotation = found.T_map_camera[:3, :3]
+        turn = np.zeros((6, 6))
+        turn[:3, 3:] = rotation
+        turn[3:, :3] = rotation
+        result: FloatArray = turn @ camera @ turn.T
+        return result
+
+    def _bias(self, session: int) -> ImuBias:
+        return ImuBias(self._window.stamps[-1], self._state.gyro_bias, self._state.accel_bias, session)
+
+    def _estimate(
+        self, stamp_ns: int, T_map_camera: FloatArray, velocity: FloatArray, rate: FloatArray, covariance: FloatArray, session: int
+    ) -> PoseEstimate:
+        return PoseEstimate(stamp_ns, T_map_camera @ self._T_cam_imu, self._T_map_odom, velocity, rate, covariance, session)
+
+
+def _inverse_depth_limits(calibration: Calibration) -> tuple[float, float]:
+    """Return the inverse depths (1/m) that a landmark may have: the laser's range, generously."""
+    near, far = calibration.laser.range_m if calibration.laser is not None else (0.02, 0.15)
+    return 0.3 / far, 3.0 / near
+
+
+__all__ = ["FrameResult", "Interval", "WindowEstimator"]

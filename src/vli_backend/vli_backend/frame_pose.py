@@ -1,0 +1,117 @@
+"""The pose of one long frame from the window's landmarks and the IMU's prediction.
+
+Between keyframes the window is not solved; each frame gets its pose by a robust pose-only adjustment (PnP with a prior). The
+uncertain depth of a landmark enters its residual's covariance: a young landmark fixes only what it can.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from vli_common.arrays import FloatArray
+
+
+@dataclass(frozen=True)
+class FramePose:
+    """Pose ``T_map_camera`` (4, 4), information (6, 6) of [ω, v] in the camera, inlier count, RMS residual in sigmas, iterations."""
+
+    T_map_camera: FloatArray
+    information: FloatArray
+    inliers: int
+    rms: float
+    iterations: int
+
+
+@numba.njit(cache=True)
+def _exp_so3(w):  # type: ignore[no-untyped-def]
+    angle = np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
+    k = np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
+    if angle < 1e-9:
+        return np.eye(3) + k
+    return np.eye(3) + np.sin(angle) / angle * k + (1.0 - np.cos(angle)) / (angle * angle) * (k @ k)
+
+
+@numba.njit(cache=True)
+def _log_so3(r):  # type: ignore[no-untyped-def]
+    cosine = min(1.0, max(-1.0, 0.5 * (r[0, 0] + r[1, 1] + r[2, 2] - 1.0)))
+    angle = np.arccos(cosine)
+    v = np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
+    scale = 0.5 if angle < 1e-6 else angle / (2.0 * np.sin(angle))
+    return scale * v
+
+
+@numba.njit(cache=True)
+def _solve(rotation, translation, points, spread, rays, sigma, prior, cauchy, iterations):  # type: ignore[no-untyped-def]
+    start_r, start_t = rotation.copy(), translation.copy()
+    h, g = np.zeros((6, 6)), np.zeros(6)
+    inliers, squares, done = 0, 0.0, 0
+    j0, j1, delta = np.empty(6), np.empty(6), np.empty(6)
+    for step in range(iterations):
+        done = step + 1
+        delta[:3] = _log_so3(start_r.T @ rotation)
+        delta[3:] = rotation.T @ (translation - start_t)
+        h[:] = prior
+        g[:] = prior @ delta
+        inliers, squares = 0, 0.0
+        rt = rotation.T
+        for i in range(len(points)):
+            x = rt @ (points[i] - translation)
+            if x[2] <= 1e-6:
+                continue
+            z = 1.0 / x[2]
+            u, v = x[0] * z, x[1] * z
+            e0, e1 = u - rays[i, 0], v - rays[i, 1]
+            d = rt @ spread[i]
+            d0, d1 = (d[0] - u * d[2]) * z, (d[1] - v * d[2]) * z
+            # Inverse of σ² I + d dᵀ (Sherman–Morrison).
+            s2 = sigma[i] * sigma[i]
+            f = 1.0 / (s2 + d0 * d0 + d1 * d1)
+            a, b, c = (1.0 - d0 * d0 * f) / s2, -d0 * d1 * f / s2, (1.0 - d1 * d1 * f) / s2
+            squared = a * e0 * e0 + 2.0 * b * e0 * e1 + c * e1 * e1
+            w = 1.0 / (1.0 + squared / (cauchy * cauchy))
+            if squared < 9.0 + 9.0 * cauchy:
+                inliers += 1
+                squares += squared
+            j0[0], j0[1], j0[2] = u * v, -(1.0 + u * u), v
+            j0[3], j0[4], j0[5] = -z, 0.0, u * z
+            j1[0], j1[1], j1[2] = 1.0 + v * v, -u * v, -u
+            j1[3], j1[4], j1[5] = 0.0, -z, v * z
+            for m in range(6):
+                p, q = w * (a * j0[m] + b * j1[m]), w * (b * j0[m] + c * j1[m])
+                g[m] += p * e0 + q * e1
+                for n in range(6):
+                    h[m, n] += p * j0[n] + q * j1[n]
+        update = -np.linalg.solve(h, g)
+        translation = translation + rotation @ update[3:]
+        rotation = rotation @ _exp_so3(update[:3])
+        if np.abs(update[:3]).max() < 1e-7 and np.abs(update[3:]).max() < 1e-9:
+            break
+    return rotation, translation, h, inliers, squares, done
+
+
+def solve_frame_pose(
+    T_predicted: FloatArray, prior: FloatArray, points: FloatArray, spread: FloatArray, rays: FloatArray, sigma: FloatArray,
+    cauchy: float, iterations: int = 10,
+) -> FramePose:  # fmt: skip
+    """Return the pose that minimises the robust reprojection error and the distance to the prediction.
+
+    Args:
+        T_predicted: (4, 4) ``T_map_camera``, start and mean of the prior.
+        prior: (6, 6) information of the prediction, [ω, v] in the camera.
+        points: (N, 3) landmarks in map.
+        spread: (N, 3) one sigma of each landmark along its anchor's ray, in map.
+        rays: (N, 2) observed.
+        sigma: (N,) of the rays.
+        cauchy: in sigmas.
+        iterations: at most.
+    """
+    rotation, translation, h, inliers, squares, done = _solve(
+        np.ascontiguousarray(T_predicted[:3, :3]), np.ascontiguousarray(T_predicted[:3, 3]), points, spread,
+        np.ascontiguousarray(rays), sigma, prior, cauchy, iterations,
+    )  # fmt: skip
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = rotation, translation
+    return FramePose(T, h, int(inliers), float(np.sqrt(squares / max(1, 2 * inliers))), int(done))

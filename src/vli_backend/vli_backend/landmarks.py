@@ -1,0 +1,164 @@
+"""The landmark table: which keyframe of the window saw which feature, and where the laser measured it.
+
+A landmark is anchored at its first observation; its bearing there is exact by definition (the track's patch was taken there).
+When the anchor leaves the window, the landmark leaves with it. A track that lives on continues as a new landmark: the older
+observations are marginalised with the anchor, the newest become the new landmark's, so nothing is counted twice and the
+window is never starved.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vli_backend.condense import LandmarkArrays
+from vli_common.arrays import AnyArray, BoolArray, FloatArray, IntArray
+
+KEPT_OBSERVATIONS = 4
+"""Newest slots whose observations continue as a new landmark when the anchor leaves."""
+
+_PRIOR_SPREAD = 0.5
+"""First guess of an inverse depth: one standard deviation, relative."""
+
+
+class LandmarkTable:
+    """L landmarks × K window slots, in arrays that the kernels read directly.
+
+    Args:
+        slots: most keyframes in the window at any time.
+    """
+
+    def __init__(self, slots: int) -> None:
+        self.slots = slots
+        self.frames = 0
+        self.ids: IntArray = np.empty(0, np.int64)
+        self.active: BoolArray = np.empty(0, np.bool_)
+        self.arrays = LandmarkArrays(
+            anchor=np.empty(0, np.int64), anchor_ray=np.empty((0, 2)), rho=np.empty(0), prior=np.empty((0, 2)),
+            rays=np.empty((0, slots, 2)), sigma=np.empty((0, slots)), depth=np.empty((0, slots)), depth_sigma=np.empty((0, slots)),
+        )  # fmt: skip
+        self.stripe: FloatArray = np.empty((0, slots))
+        self.information: FloatArray = np.empty(0)
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    @property
+    def observations(self) -> IntArray:
+        """Number of keyframes that saw each landmark, the anchor included (L,)."""
+        return np.count_nonzero(self.arrays.sigma > 0, axis=1)
+
+    @property
+    def usable(self) -> BoolArray:
+        """Landmarks seen at least twice: they say something of the poses (L,)."""
+        return self.observations >= 2
+
+    def rows_of(self, ids: IntArray) -> IntArray:
+        """Return the row of the active landmark of each id, −1 where there is none."""
+        lookup = {int(key): row for row, key in enumerate(self.ids) if self.active[row]}
+        return np.array([lookup.get(int(key), -1) for key in ids], dtype=np.int64)
+
+    def add_keyframe(self, ids: IntArray, rays: FloatArray, sigma: FloatArray, restarted: BoolArray, rho_guess: float) -> None:
+        """Append a keyframe: known ids get an observation, new ones (and restarted tracks) a landmark anchored here.
+
+        Args:
+            ids: (N,).
+            rays: (N, 2).
+            sigma: (N,) of the rays (normalised units).
+            restarted: (N,) True where the track's patch was taken anew since the last keyframe.
+            rho_guess: first inverse depth of new landmarks, 1/m.
+        """
+        slot = self.frames
+        self.frames += 1
+        rows = self.rows_of(ids)
+        self.active[rows[(rows >= 0) & restarted]] = False
+        known = (rows >= 0) & ~restarted
+        self.arrays.rays[rows[known], slot] = rays[known]
+        self.arrays.sigma[rows[known], slot] = sigma[known]
+        self._append(ids[~known], slot, rays[~known], sigma[~known], np.full(np.count_nonzero(~known), rho_guess))
+
+    def set_depths(self, slot: int, rows: IntArray, inverse_depth: FloatArray, sigma: FloatArray, stripe_px: FloatArray, primary_only: bool) -> None:
+        """Store laser depths, eq. (2), of landmarks seen in ``slot``.
+
+        With ``primary_only`` a landmark keeps the one depth of the frame in which it was nearest to the stripe (its primary frame).
+        """
+        if primary_only:
+            others = self.stripe[rows].copy()
+            others[:, slot] = np.inf
+            better = stripe_px <= others.min(axis=1)
+            self.arrays.depth_sigma[rows[~better], slot] = 0.0
+            self.stripe[rows[~better], slot] = np.inf
+            rows, inverse_depth, sigma, stripe_px = rows[better], inverse_depth[better], sigma[better], stripe_px[better]
+            self.arrays.depth_sigma[rows] = 0.0
+            self.stripe[rows] = np.inf
+        self.arrays.depth[rows, slot] = inverse_depth
+        self.arrays.depth_sigma[rows, slot] = sigma
+        self.stripe[rows, slot] = stripe_px
+
+    def split(self) -> BoolArray:
+        """Prepare the oldest keyframe's departure; return the mask (L,) of landmarks that leave with it.
+
+        A leaving landmark whose track is still followed hands its newest observations to a new landmark.
+        """
+        arrays = self.arrays
+        leaving = arrays.anchor == 0
+        first_kept = max(1, self.frames - KEPT_OBSERVATIONS)
+        kept = arrays.sigma[:, first_kept : self.frames] > 0
+        continues = leaving & self.active & kept[:, -1] & (np.count_nonzero(kept, axis=1) >= 2)
+        rows = np.flatnonzero(continues)
+        anchors = first_kept + np.argmax(kept[rows], axis=1)
+        old = len(self)
+        rho = arrays.rho[rows]
+        self._append(self.ids[rows], anchors, arrays.rays[rows, anchors], arrays.sigma[rows, anchors], rho)
+        self.active[rows] = False
+        window = slice(first_kept, self.slots)
+        for name in ("rays", "sigma", "depth", "depth_sigma"):
+            table = getattr(self.arrays, name)
+            table[old:, window] = table[rows, window]
+        self.stripe[old:, window] = self.stripe[rows, window]
+        self.information[old:] = self.information[rows]
+        self.arrays.sigma[rows, window] = 0.0
+        self.arrays.depth_sigma[rows, window] = 0.0
+        return np.concatenate([leaving, np.zeros(len(rows), np.bool_)])
+
+    def drop_oldest(self, leaving: BoolArray) -> None:
+        """Remove the landmarks that leave, and slot 0; all others move one slot down."""
+        self._keep(~leaving)
+        arrays = self.arrays
+        arrays.anchor -= 1
+        for name, empty in (("rays", 0.0), ("sigma", 0.0), ("depth", 0.0), ("depth_sigma", 0.0)):
+            table = getattr(arrays, name)
+            table[:, :-1] = table[:, 1:].copy()
+            table[:, -1] = empty
+        self.stripe[:, :-1] = self.stripe[:, 1:].copy()
+        self.stripe[:, -1] = np.inf
+        self.frames -= 1
+
+    def forget_lost(self, ids: IntArray) -> None:
+        """Deactivate landmarks whose track has ended; those seen only once are removed."""
+        lost = self.active & ~np.isin(self.ids, ids)
+        self.active[lost] = False
+        self._keep(self.active | (self.observations >= 2))
+
+    def _append(self, ids: IntArray, anchors: AnyArray | int, rays: FloatArray, sigma: FloatArray, rho: FloatArray) -> None:
+        count, old = len(ids), len(self)
+        arrays = self.arrays
+        self.ids = np.concatenate([self.ids, ids])
+        self.active = np.concatenate([self.active, np.ones(count, np.bool_)])
+        arrays.anchor = np.concatenate([arrays.anchor, np.broadcast_to(np.asarray(anchors, np.int64), count)])
+        arrays.anchor_ray = np.concatenate([arrays.anchor_ray, rays])
+        arrays.rho = np.concatenate([arrays.rho, rho])
+        arrays.prior = np.concatenate([arrays.prior, np.stack([rho, _PRIOR_SPREAD * rho], axis=1)])
+        arrays.rays = np.concatenate([arrays.rays, np.zeros((count, self.slots, 2))])
+        for name in ("sigma", "depth", "depth_sigma"):
+            setattr(arrays, name, np.concatenate([getattr(arrays, name), np.zeros((count, self.slots))]))
+        self.stripe = np.concatenate([self.stripe, np.full((count, self.slots), np.inf)])
+        self.information = np.concatenate([self.information, np.full(count, 0.0)])
+        rows = np.arange(old, old + count)
+        arrays.rays[rows, anchors] = rays
+        arrays.sigma[rows, anchors] = sigma
+
+    def _keep(self, mask: BoolArray) -> None:
+        arrays = self.arrays
+        self.ids, self.active, self.stripe, self.information = self.ids[mask], self.active[mask], self.stripe[mask], self.information[mask]
+        for name in ("anchor", "anchor_ray", "rho", "prior", "rays", "sigma", "depth", "depth_sigma"):
+            setattr(arrays, name, np.ascontiguousarray(getattr(arrays, name)[mask]))

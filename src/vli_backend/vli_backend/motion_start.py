@@ -1,0 +1,132 @@
+"""Structure from motion over the first keyframes of a start in motion, metric from the beginning by the laser."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from vli_backend.condense import Quadratic, condense, refine
+from vli_backend.config import BackEndConfig
+from vli_backend.frame_pose import solve_frame_pose
+from vli_backend.initialisation import bundle_adjust, chain_rotations
+from vli_backend.landmarks import LandmarkTable
+from vli_backend.laser_depth import laser_depths
+from vli_backend.window import FrameRecord, Window, close_interval
+from vli_common.arrays import FloatArray
+from vli_common.calibration import Calibration
+from vli_common.geometry import inverse, pose
+from vli_common.types import LaserScan, Tracks
+
+_ROUNDS = 3
+"""Laser depths need poses and poses need laser depths: they alternate."""
+
+_MIN_DEPTHS = 4
+
+
+@dataclass(frozen=True)
+class Structure:
+    """IMU poses (K, 4, 4) in a world that is the first camera's; ``problem`` says why there are none."""
+
+    T_world_imu: FloatArray
+    problem: str = ""
+
+
+def structure_from_motion(
+    calibration: Calibration, config: BackEndConfig, tracks: list[Tracks], imu: list[gtsam.PreintegratedCombinedMeasurements],
+    scans: list[LaserScan],
+) -> Structure:  # fmt: skip
+    """Return metric keyframe poses from tracks, gyro rotations and stripes.
+
+    Args:
+        calibration: camera, IMU, laser.
+        config: parameters.
+        tracks: of the K keyframes.
+        imu: the K − 1 preintegrations between them (only their rotations are used).
+        scans: stripes taken meanwhile.
+    """
+    T_cam_imu = calibration.T_cam_imu if calibration.T_cam_imu is not None else np.eye(4)
+    focal = calibration.camera.focal_px
+    rotations = chain_rotations(list(imu), T_cam_imu)
+    parallax = _parallax_px(tracks, rotations, focal)
+    if parallax < config.start_parallax_px:
+        return Structure(np.empty((0, 4, 4)), f"{parallax:.0f} px of parallax, {config.start_parallax_px:.0f} are needed: move sideways")
+    table = LandmarkTable(max(len(tracks), 2))
+    guess = 1.0 / float(np.median(np.concatenate([scan.points[:, 2] for scan in scans])))
+    limits = (guess / 6.0, guess * 6.0)
+    poses = _chain(table, config, tracks, rotations, guess, focal, limits)
+    use = table.usable
+
+    def linearise(T_world_camera: FloatArray) -> Quadratic:
+        refine(table.arrays, T_world_camera, use, config.cauchy, limits)
+        return condense(table.arrays, T_world_camera, use, config.cauchy)
+
+    measured = 0
+    for _ in range(_ROUNDS):
+        measured = _measure(table, config, tracks, poses, scans, focal)
+        poses, _ = bundle_adjust(linearise, poses, config.start_iterations)
+    if measured < _MIN_DEPTHS:
+        return Structure(np.empty((0, 4, 4)), f"{measured} features near the stripe, {_MIN_DEPTHS} are needed")
+    return Structure(poses @ T_cam_imu)
+
+
+def _parallax_px(tracks: list[Tracks], rotations: FloatArray, focal_px: float) -> float:
+    """Return the median rotation-compensated shift between the first and the last keyframe they share enough with."""
+    first = tracks[0]
+    best = 0.0
+    for other, rotation in zip(tracks[1:], rotations[1:], strict=True):
+        _, a, b = np.intersect1d(first.ids, other.ids, assume_unique=True, return_indices=True)
+        if len(a) < 10:
+            break
+        turned = np.concatenate([other.rays[b], np.ones((len(b), 1))], axis=1) @ rotation.T
+        best = max(best, float(np.median(np.linalg.norm(turned[:, :2] / turned[:, 2:] - first.rays[a], axis=1))) * focal_px)
+    return best
+
+
+def _chain(
+    table: LandmarkTable, config: BackEndConfig, tracks: list[Tracks], rotations: FloatArray, guess: float, focal: float, limits: tuple[float, float]
+) -> FloatArray:  # fmt: skip
+    """Return camera poses (K, 4, 4) by PnP from keyframe to keyframe; the landmarks' depths follow each step."""
+    poses = [np.eye(4)]
+    for k, track in enumerate(tracks):
+        sigma = np.hypot(track.sigma_px, config.pixel_sigma) / focal
+        if k > 0:
+            predicted = pose(poses[-1][:3, :3] @ rotations[k - 1].T @ rotations[k], poses[-1][:3, 3])
+            rows = table.rows_of(track.ids)
+            seen = np.flatnonzero(rows >= 0)
+            arrays = table.arrays
+            anchors = np.stack(poses)[arrays.anchor[rows[seen]]]
+            rays = np.concatenate([arrays.anchor_ray[rows[seen]], np.ones((len(seen), 1))], axis=1)
+            directions = np.einsum("nij,nj->ni", anchors[:, :3, :3], rays) / arrays.rho[rows[seen], None]
+            prior = np.diag(np.repeat([0.02**-2, 0.05**-2], 3))
+            found = solve_frame_pose(predicted, prior, directions + anchors[:, :3, 3], 0.1 * directions, track.rays[seen], sigma[seen], 2.0)
+            poses.append(found.T_map_camera)
+        table.add_keyframe(track.ids, track.rays, sigma, np.zeros(len(track), np.bool_), guess)
+        refine(table.arrays, np.stack(poses), table.usable, config.cauchy, limits)
+    return np.stack(poses)
+
+
+def _measure(
+    table: LandmarkTable, config: BackEndConfig, tracks: list[Tracks], poses: FloatArray, scans: list[LaserScan], focal: float
+) -> int:  # fmt: skip
+    """Set the laser depths of all keyframes at the present poses; return how many landmarks have one."""
+    window = Window()
+    for k, track in enumerate(tracks):
+        pair = [FrameRecord(tracks[i].stamp_ns, poses[i], False) for i in (k - 1, k)] if k else []
+        window.append(track.stamp_ns, False, close_interval(pair, scans) if k else None)
+    for slot in range(len(tracks)):
+        stripes = window.near_scans(slot, poses, round(config.depth_window_s * 1e9))
+        if not stripes:
+            continue
+        back = inverse(poses[slot])
+        points = np.concatenate([scan.points @ (T := back @ T_scan)[:3, :3].T + T[:3, 3] for T_scan, scan in stripes])
+        sigma = np.concatenate([scan.sigma for _, scan in stripes])
+        rows = np.flatnonzero(table.arrays.sigma[:, slot] > 0)
+        found = laser_depths(
+            table.arrays.rays[rows, slot], points, sigma, focal, config.depth_radius_px, config.depth_min_points, 3 * config.depth_max_rms
+        )
+        good = np.isfinite(found.inverse_depth)
+        floor = config.depth_sigma / 0.03**2
+        table.set_depths(slot, rows[good], found.inverse_depth[good], np.hypot(found.sigma[good], floor), found.stripe_px[good], True)
+    return int(np.count_nonzero((table.arrays.depth_sigma > 0).any(axis=1)))

@@ -1,0 +1,238 @@
+"""The window's optimiser: GTSAM's fixed-lag smoother over keyframe poses, velocities and IMU biases.
+
+IMU factors and the marginal prior live in the smoother. Landmarks, laser depths and map constraints reach it condensed
+(:class:`vli_backend.condense.Quadratic`): one linear container over the window's poses, re-linearised and replaced at every
+iteration. What leaves with the oldest keyframe is handed over separately at the end, so that the smoother marginalises it once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, V, X
+
+from vli_backend.condense import Quadratic
+from vli_common.arrays import FloatArray
+from vli_common.errors import VliError
+
+
+class SmootherError(VliError):
+    """The optimiser failed (indeterminate system); the window must be damped or started anew."""
+
+
+@dataclass(frozen=True)
+class KeyframeState:
+    """Pose ``T_map_imu`` (4, 4), velocity (3,) in map, gyro and accelerometer bias (3,) each."""
+
+    T_map_imu: FloatArray
+    velocity: FloatArray
+    gyro_bias: FloatArray
+    accel_bias: FloatArray
+
+    def nav_state(self) -> gtsam.NavState:
+        """Return pose and velocity for IMU prediction."""
+        return gtsam.NavState(gtsam.Pose3(self.T_map_imu), self.velocity)
+
+    def bias(self) -> gtsam.imuBias.ConstantBias:
+        """Return the bias as GTSAM has it (accelerometer first)."""
+        return gtsam.imuBias.ConstantBias(self.accel_bias, self.gyro_bias)
+
+
+@dataclass(frozen=True)
+class StatePrior:
+    """Standard deviations of the first keyframe: rotation (3,) about imu_link, position, velocity, gyro bias, accelerometer bias."""
+
+    rotation: FloatArray
+    position: float
+    velocity: float
+    gyro_bias: float
+    accel_bias: float
+
+
+Condenser = Callable[[FloatArray], Quadratic]
+"""Linearises the visual and map residuals at body poses (K, 4, 4)."""
+
+
+class Smoother(Protocol):
+    """What the back end needs of a fixed-lag smoother."""
+
+    def start(self, state: KeyframeState, prior: StatePrior) -> None:
+        """Begin a window with one keyframe."""
+
+    def add_keyframe(self, state: KeyframeState, imu: gtsam.PreintegratedCombinedMeasurements | None, elapsed_s: float) -> None:
+        """Append a keyframe with its first guess; without ``imu`` only the biases are linked to the last keyframe."""
+
+    def solve(self, condenser: Condenser, iterations: int) -> int:
+        """Iterate to convergence; return the iterations used."""
+
+    def marginalise_oldest(self, leaving: Condenser, staying: Condenser) -> None:
+        """Remove the oldest keyframe; ``leaving`` is marginalised with it and holds all residuals that touch it."""
+
+    def states(self) -> list[KeyframeState]:
+        """Return all states in the window, oldest first."""
+
+    def newest_covariance(self) -> FloatArray:
+        """Return the (6, 6) marginal covariance of the newest pose, [ω, v] in imu_link."""
+
+
+class GtsamSmoother:
+    """:class:`Smoother` on ``gtsam.BatchFixedLagSmoother``.
+
+    The smoother's clock is the keyframe index. A new keyframe is first given the index of its predecessor, so that nothing
+    expires while the window iterates; its own index, set by :meth:`marginalise_oldest`, is what lets the oldest go.
+
+    Args:
+        keyframes: window length N; between :meth:`add_keyframe` and :meth:`marginalise_oldest` there may be N + 1.
+        tolerance: largest pose step (rad, m) at which the iteration stops.
+    """
+
+    def __init__(self, keyframes: int, tolerance: tuple[float, float] = (1e-6, 1e-7)) -> None:
+        self._keyframes = keyframes
+        self._tolerance = tolerance
+        parameters = gtsam.LevenbergMarquardtParams()
+        parameters.setMaxIterations(3)
+        parameters.setlambdaInitial(1e-9)
+        parameters.setLinearSolverType("MULTIFRONTAL_CHOLESKY")
+        self._smoother = gtsam.BatchFixedLagSmoother(keyframes - 0.5, parameters)
+        self._first = 0
+        self._count = 0
+        self._container: gtsam.LinearContainerFactor | None = None
+        self._estimate = gtsam.Values()
+        self._waiting: tuple[gtsam.NonlinearFactorGraph, gtsam.Values, dict[int, float]] | None = None
+
+    def start(self, state: KeyframeState, prior: StatePrior) -> None:
+        """See :meth:`Smoother.start`."""
+        values, graph = gtsam.Values(), gtsam.NonlinearFactorGraph()
+        pose, bias = gtsam.Pose3(state.T_map_imu), state.bias()
+        _insert(values, 0, pose, state)
+        sigmas = np.concatenate([prior.rotation, np.full(3, prior.position)])
+        graph.add(gtsam.PriorFactorPose3(X(0), pose, gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
+        graph.add(gtsam.PriorFactorVector(V(0), state.velocity, gtsam.noiseModel.Isotropic.Sigma(3, prior.velocity)))
+        sigmas = np.repeat([prior.accel_bias, prior.gyro_bias], 3)
+        graph.add(gtsam.PriorFactorConstantBias(B(0), bias, gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
+        self._count = 1
+        self._update(graph, values, {X(0): 0.0, V(0): 0.0, B(0): 0.0})
+
+    def add_keyframe(self, state: KeyframeState, imu: gtsam.PreintegratedCombinedMeasurements | None, elapsed_s: float) -> None:
+        """See :meth:`Smoother.add_keyframe`."""
+        last, new = self._first + self._count - 1, self._first + self._count
+        values, graph = gtsam.Values(), gtsam.NonlinearFactorGraph()
+        _insert(values, new, gtsam.Pose3(state.T_map_imu), state)
+        if imu is not None:
+            graph.add(gtsam.CombinedImuFactor(X(last), V(last), X(new), V(new), B(last), B(new), imu))
+        else:
+            walk = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([1e-2, 1e-3], 3) * max(elapsed_s, 1e-3) ** 0.5)
+            graph.add(gtsam.BetweenFactorConstantBias(B(last), B(new), gtsam.imuBias.ConstantBias(), walk))
+            graph.add(gtsam.PriorFactorVector(V(new), state.velocity, gtsam.noiseModel.Isotropic.Sigma(3, 0.1)))
+        self._count += 1
+        # Held back until the first container is there: without residuals of its own the new pose may be undetermined.
+        self._waiting = (graph, values, {key: float(last) for i in (last, new) for key in (X(i), V(i), B(i))})
+        self._estimate.insert(values)
+
+    def solve(self, condenser: Condenser, iterations: int) -> int:
+        """See :meth:`Smoother.solve`."""
+        poses = self._poses()
+        for iteration in range(iterations):
+            self._replace(self._to_container(condenser(poses)))
+            moved = self._poses()
+            step_m = float(np.abs(moved[:, :3, 3] - poses[:, :3, 3]).max())
+            step_rad = float(np.abs(moved[:, :3, :3] - poses[:, :3, :3]).max())
+            poses = moved
+            if step_rad < self._tolerance[0] and step_m < self._tolerance[1]:
+                return iteration + 1
+        return iterations
+
+    def marginalise_oldest(self, leaving: Condenser, staying: Condenser) -> None:
+        """See :meth:`Smoother.marginalise_oldest`."""
+        poses = self._poses()
+        newest = self._first + self._count - 1
+        stay = self._to_container(staying(poses), skip=1)
+        graph = gtsam.NonlinearFactorGraph()
+        graph.add(self._to_container(leaving(poses)))
+        graph.add(stay)
+        removed = [self._slot_of(self._container)] if self._container is not None else []
+        time = float(self._first + self._keyframes)
+        self._update(graph, gtsam.Values(), {X(newest): time, V(newest): time, B(newest): time}, removed)
+        self._container = stay
+        self._first += 1
+        self._count -= 1
+
+    def states(self) -> list[KeyframeState]:
+        """See :meth:`Smoother.states`."""
+        result = []
+        for k in range(self._first, self._first + self._count):
+            bias = self._estimate.atConstantBias(B(k))
+            pose = self._estimate.atPose3(X(k)).matrix()
+            result.append(KeyframeState(pose, self._estimate.atVector(V(k)), bias.gyroscope(), bias.accelerometer()))
+        return result
+
+    def newest_covariance(self) -> FloatArray:
+        """See :meth:`Smoother.newest_covariance`."""
+        try:
+            marginals = gtsam.Marginals(self._smoother.getFactors(), self._smoother.getLinearizationPoint())
+            return np.asarray(marginals.marginalCovariance(X(self._first + self._count - 1)))
+        except RuntimeError as error:
+            raise SmootherError(f"no covariance: {_first_line(error)}") from error
+
+    def _poses(self) -> FloatArray:
+        return np.stack([self._estimate.atPose3(X(k)).matrix() for k in range(self._first, self._first + self._count)])
+
+    def _to_container(self, quadratic: Quadratic, skip: int = 0) -> gtsam.LinearContainerFactor:
+        """Return the quadratic, without its ``skip`` oldest poses, as one factor.
+
+        It is summed up from pairs: from Python GTSAM takes no larger Hessian factor.
+        """
+        keys = [X(k) for k in range(self._first + skip, self._first + self._count)]
+        blocks = gtsam.GaussianFactorGraph()
+        count, h, g = len(keys), quadratic.hessian[6 * skip :, 6 * skip :], -quadratic.gradient[6 * skip :]
+        zero, none = np.zeros((6, 6)), np.zeros(6)
+        for i in range(count):
+            a = slice(6 * i, 6 * i + 6)
+            constant = quadratic.constant if i == 0 else 0.0
+            blocks.push_back(gtsam.HessianFactor(keys[i], h[a, a], g[a], constant))
+            for j in range(i + 1, count):
+                b = slice(6 * j, 6 * j + 6)
+                if h[a, b].any():
+                    blocks.push_back(gtsam.HessianFactor(keys[i], keys[j], zero, h[a, b], none, zero, none, 0.0))
+        point = gtsam.Values()
+        for key in keys:
+            point.insert(key, self._estimate.atPose3(key))
+        return gtsam.LinearContainerFactor(gtsam.HessianFactor(blocks), point)
+
+    def _replace(self, container: gtsam.LinearContainerFactor) -> None:
+        graph, values, stamps = self._waiting or (gtsam.NonlinearFactorGraph(), gtsam.Values(), {})
+        self._waiting = None
+        graph.add(container)
+        removed = [self._slot_of(self._container)] if self._container is not None else []
+        self._update(graph, values, stamps, removed)
+        self._container = container
+
+    def _slot_of(self, factor: gtsam.NonlinearFactor) -> int:
+        factors = self._smoother.getFactors()
+        for slot in range(factors.size() - 1, -1, -1):
+            if factors.exists(slot) and factors.at(slot) is factor:
+                return slot
+        raise SmootherError("a factor to be replaced is no longer in the smoother")
+
+    def _update(
+        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, stamps: dict[int, float], removed: Sequence[int] = ()
+    ) -> None:
+        try:
+            self._smoother.update(graph, values, stamps, list(removed))
+            self._estimate = self._smoother.calculateEstimate()
+        except RuntimeError as error:
+            raise SmootherError(_first_line(error)) from error
+
+
+def _insert(values: gtsam.Values, index: int, pose: gtsam.Pose3, state: KeyframeState) -> None:
+    values.insert(X(index), pose)
+    values.insert(V(index), state.velocity)
+    values.insert(B(index), state.bias())
+
+
+def _first_line(error: Exception) -> str:
+    return next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)

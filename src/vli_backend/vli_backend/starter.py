@@ -1,0 +1,140 @@
+"""Collects frames until a window can be started, at rest or in motion, and says what is missing."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import gtsam
+import numpy as np
+
+from vli_backend.config import BackEndConfig
+from vli_backend.estimator import WindowEstimator
+from vli_backend.initialisation import GRAVITY, align_imu, apply_alignment, rest_state
+from vli_backend.motion_start import structure_from_motion
+from vli_backend.smoother import KeyframeState, StatePrior
+from vli_common.arrays import FloatArray
+from vli_common.calibration import Calibration
+from vli_common.geometry import so3_log
+from vli_common.types import FrontEndOutput, LaserScan, Mode, Preintegration, Tracks
+
+_SCAN_MEMORY_NS = 4_000_000_000
+_MIN_FEATURES = 15
+
+
+class Starter:
+    """Waits for a start.
+
+    At rest: one keyframe, gravity from the accelerometer, depths from the stripe. In motion: several keyframes with parallax,
+    structure from motion with laser depths, then the IMU.
+
+    Args:
+        calibration: camera, IMU, laser.
+        config: parameters.
+        mode: which sensors take part.
+    """
+
+    def __init__(self, calibration: Calibration, config: BackEndConfig, mode: Mode) -> None:
+        self._calibration = calibration
+        self._config = config
+        self._mode = mode
+        self._keyframes: list[FrontEndOutput] = []
+        self._scans: list[LaserScan] = []
+        self._moved = False
+        self.reason = "waiting for the first keyframe"
+
+    def add_scan(self, scan: LaserScan) -> None:
+        """Keep a stripe for the first depths."""
+        self._scans.append(scan)
+        while self._scans[-1].stamp_ns - self._scans[0].stamp_ns > _SCAN_MEMORY_NS:
+            del self._scans[0]
+
+    def add_frame(self, frame: FrontEndOutput, T_map_imu: FloatArray) -> WindowEstimator | None:
+        """Take one long frame; return the started window, or None with :attr:`reason` saying why not yet.
+
+        Args:
+            frame: of the front end.
+            T_map_imu: (4, 4) where to start: position and heading of the new window.
+        """
+        tracks = frame.tracks
+        if tracks.keyframe:
+            if self._keyframes and not self._connected(frame):
+                self._keyframes.clear()
+            self._keyframes.append(frame)
+            self._moved = not tracks.stationary
+            del self._keyframes[: -self._config.window_keyframes]
+        self._moved |= not tracks.stationary
+        if problem := self._missing(tracks):
+            self.reason = problem
+            return None
+        if not self._moved or not self._mode.uses_imu:
+            return self._start_at_rest(frame, T_map_imu)
+        if tracks.keyframe:
+            return self._start_in_motion(T_map_imu)
+        return None
+
+    def _connected(self, frame: FrontEndOutput) -> bool:
+        shared = np.intersect1d(frame.tracks.ids, self._keyframes[-1].tracks.ids)
+        has_imu = frame.preintegration is not None or not self._mode.uses_imu
+        return len(shared) >= _MIN_FEATURES and has_imu
+
+    def _missing(self, tracks: Tracks) -> str | None:
+        if not self._keyframes:
+            return "waiting for the first keyframe"
+        if len(tracks) < _MIN_FEATURES:
+            return f"only {len(tracks)} features, {_MIN_FEATURES} are needed: more texture, more light, or closer"
+        if self._mode.uses_laser and not self._scans:
+            return "no laser stripe seen yet"
+        return None
+
+    def _start_at_rest(self, frame: FrontEndOutput, T_map_imu: FloatArray) -> WindowEstimator | None:
+        first = self._keyframes[-1].tracks
+        if not self._mode.uses_imu:
+            return self._estimator(first, KeyframeState(T_map_imu, np.zeros(3), np.zeros(3), np.zeros(3)), 0.05)
+        pim = _measurements(frame.preintegration)
+        if pim is None or pim.deltaTij() < self._config.start_rest_s:
+            self.reason = f"at rest, collecting IMU samples for {self._config.start_rest_s} s"
+            return None
+        self.reason = "started at rest"
+        return self._estimator(first, _placed(rest_state(pim), T_map_imu), 0.01)
+
+    def _start_in_motion(self, T_map_imu: FloatArray) -> WindowEstimator | None:
+        config = self._config
+        if len(self._keyframes) < config.start_min_keyframes:
+            self.reason = f"in motion, {len(self._keyframes)} of {config.start_min_keyframes} keyframes"
+            return None
+        tracks = [frame.tracks for frame in self._keyframes]
+        imu = [pim for frame in self._keyframes[1:] if (pim := _measurements(frame.preintegration)) is not None]
+        structure = structure_from_motion(self._calibration, config, tracks, imu, self._scans)
+        if structure.problem:
+            self.reason = f"in motion, {structure.problem}"
+            return None
+        alignment = align_imu(structure.T_world_imu, imu)
+        if abs(alignment.gravity_norm - GRAVITY) > 0.15 * GRAVITY:
+            self.reason = f"in motion, gravity comes out as {alignment.gravity_norm:.1f} m/s²"
+            return None
+        states = [_placed(state, T_map_imu) for state in apply_alignment(structure.T_world_imu, alignment)]
+        estimator = self._estimator(tracks[0], states[0], 0.1)
+        for track, state, pim in zip(tracks[1:], states[1:], imu, strict=True):
+            estimator.add_start_keyframe(track, state, pim)
+        estimator.finish_start()
+        self.reason = "started in motion"
+        return estimator
+
+    def _estimator(self, tracks: Tracks, state: KeyframeState, velocity_sigma: float) -> WindowEstimator:
+        config = self._config
+        prior = StatePrior(np.full(3, config.tilt_sigma), 1e-6, velocity_sigma, config.gyro_bias_sigma, config.accel_bias_sigma)
+        return WindowEstimator(self._calibration, config, tracks, state, prior, self._scans)
+
+
+def _placed(state: KeyframeState, T_map_imu: FloatArray) -> KeyframeState:
+    """Return the state moved to a position and heading; its tilt, which gravity gave, stays."""
+    heading = so3_log(T_map_imu[:3, :3])[2]
+    c, s = np.cos(heading), np.sin(heading)
+    turn = np.eye(4)
+    turn[:2, :2] = [[c, -s], [s, c]]
+    turn[:3, 3] = T_map_imu[:3, 3]
+    return KeyframeState(turn @ state.T_map_imu, turn[:3, :3] @ state.velocity, state.gyro_bias, state.accel_bias)
+
+
+def _measurements(preintegration: Preintegration | None) -> gtsam.PreintegratedCombinedMeasurements | None:
+    return None if preintegration is None else cast(gtsam.PreintegratedCombinedMeasurements, preintegration.measurements)

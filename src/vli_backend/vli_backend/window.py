@@ -1,0 +1,145 @@
+"""Frames between keyframes: where each stripe was, given the keyframes around it.
+
+Eq. (4) interpolates the pose of a stripe between the adjacent keyframes. Under hand tremor that alone misplaces a stripe by some
+0.1 mm, more than the laser's noise. So the measured shape of the motion is folded in: every long frame has a pose of its own; a
+frame's deviation δ from the interpolation, δ = interp(T_k, T_k+1, α)⁻¹ T, is taken once when the interval closes and kept while the
+keyframes move.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from vli_common.arrays import BoolArray, ByteArray, FloatArray, IntArray
+from vli_common.geometry import interpolate, inverse
+from vli_common.types import FrameKind, LaserScan, WindowPoses
+
+
+@dataclass(frozen=True)
+class Interval:
+    """Long and short frames strictly between two adjacent keyframes.
+
+    Args:
+        stamps: (M,) int64, ascending.
+        kinds: (M,) :class:`FrameKind` codes.
+        redundant: (M,) bool, taken at rest.
+        alpha: (M,) position between the keyframes, 0 to 1.
+        delta: (M, 4, 4) deviation from the interpolated pose.
+        scans: by stamp, those of the short frames.
+    """
+
+    stamps: IntArray
+    kinds: ByteArray
+    redundant: BoolArray
+    alpha: FloatArray
+    delta: FloatArray
+    scans: dict[int, LaserScan] = field(default_factory=dict)
+
+    def poses(self, T_start: FloatArray, T_end: FloatArray) -> FloatArray:
+        """Return ``T_map_camera`` (M, 4, 4) of the frames, given those of the two keyframes."""
+        if not len(self.stamps):
+            return np.empty((0, 4, 4))
+        return interpolate(T_start, T_end, self.alpha) @ self.delta
+
+
+@dataclass(frozen=True)
+class FrameRecord:
+    """A long frame since the last keyframe: stamp, ``T_map_camera`` (4, 4), at rest or not."""
+
+    stamp_ns: int
+    T_map_camera: FloatArray
+    stationary: bool
+
+
+def close_interval(frames: list[FrameRecord], scans: list[LaserScan]) -> Interval:
+    """Return the interval between ``frames[0]`` and ``frames[-1]`` (the keyframes), with the scans taken in it.
+
+    Short frames get the pose between the two long frames around them.
+    """
+    start, end = frames[0], frames[-1]
+    inner = frames[1:-1]
+    scans = [scan for scan in scans if start.stamp_ns < scan.stamp_ns < end.stamp_ns]
+    stamps = np.array([f.stamp_ns for f in frames], dtype=np.int64)
+    scan_stamps = np.array([s.stamp_ns for s in scans], dtype=np.int64)
+    before = np.clip(np.searchsorted(stamps, scan_stamps, side="right") - 1, 0, len(frames) - 2)
+    poses = np.stack([f.T_map_camera for f in frames])
+    fraction = (scan_stamps - stamps[before]) / (stamps[before + 1] - stamps[before])
+    scan_poses = interpolate(poses[before], poses[before + 1], fraction) if scans else np.empty((0, 4, 4))
+    rest = np.array([f.stationary for f in frames], np.bool_)
+
+    all_stamps = np.concatenate([stamps[1:-1], scan_stamps])
+    order = np.argsort(all_stamps, kind="stable")
+    all_poses = np.concatenate([poses[1:-1], scan_poses])[order]
+    alpha = (all_stamps[order] - start.stamp_ns) / (end.stamp_ns - start.stamp_ns)
+    kinds = np.concatenate([np.full(len(inner), FrameKind.LONG.value), np.full(len(scans), FrameKind.SHORT.value)])
+    redundant = np.concatenate([rest[1:-1], rest[before] & rest[before + 1]])
+    interpolated = interpolate(start.T_map_camera, end.T_map_camera, alpha) if len(alpha) else np.empty((0, 4, 4))
+    return Interval(
+        all_stamps[order], kinds[order].astype(np.uint8), redundant[order], alpha, inverse(interpolated) @ all_poses,
+        {scan.stamp_ns: scan for scan in scans},
+    )  # fmt: skip
+
+
+class Window:
+    """Keyframe stamps and the intervals between them; poses are handed in by the caller, who has them from the smoother."""
+
+    def __init__(self) -> None:
+        self.stamps: list[int] = []
+        self.stationary: list[bool] = []
+        self.intervals: list[Interval] = []
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    def append(self, stamp_ns: int, stationary: bool, interval: Interval | None) -> None:
+        """Add a keyframe and the interval before it (None for the first)."""
+        if interval is not None:
+            self.intervals.append(interval)
+        self.stamps.append(stamp_ns)
+        self.stationary.append(stationary)
+
+    def drop_oldest(self) -> None:
+        """Forget the oldest keyframe and the interval after it."""
+        del self.stamps[0], self.stationary[0], self.intervals[0]
+
+    def near_scans(self, slot: int, T_map_camera: FloatArray, within_ns: int) -> list[tuple[FloatArray, LaserScan]]:
+        """Return (pose (4, 4), scan) of the scans within ``within_ns`` of a keyframe, keyframe poses (K, 4, 4) given."""
+        centre = self.stamps[slot]
+        found: list[tuple[FloatArray, LaserScan]] = []
+        for k in range(max(0, slot - 2), min(len(self.intervals), slot + 2)):
+            interval = self.intervals[k]
+            short = (interval.kinds == FrameKind.SHORT.value) & (np.abs(interval.stamps - centre) <= within_ns)
+            if short.any():
+                poses = interval.poses(T_map_camera[k], T_map_camera[k + 1])[short]
+                found += [(pose, interval.scans[int(stamp)]) for pose, stamp in zip(poses, interval.stamps[short], strict=True)]
+        return found
+
+    def poses(self, T_map_camera: FloatArray, leaving: int, session: int) -> WindowPoses:
+        """Return all frames of the window; the first ``leaving`` keyframes and the intervals after them are final.
+
+        Args:
+            T_map_camera: (K, 4, 4) of the keyframes.
+            leaving: how many keyframes leave the window.
+            session: of the message.
+        """
+        stamps, kinds, final, redundant, poses = [], [], [], [], []
+        for k, stamp in enumerate(self.stamps):
+            stamps.append(np.array([stamp], np.int64))
+            kinds.append(np.array([FrameKind.KEYFRAME.value], np.uint8))
+            redundant.append(np.array([self.stationary[k]]))
+            poses.append(T_map_camera[k][None])
+            count = 1
+            if k < len(self.intervals):
+                interval = self.intervals[k]
+                stamps.append(interval.stamps)
+                kinds.append(interval.kinds)
+                redundant.append(interval.redundant)
+                poses.append(interval.poses(T_map_camera[k], T_map_camera[k + 1]))
+                count += len(interval.stamps)
+            final.append(np.full(count, k < leaving))
+        return WindowPoses(
+            self.stamps[-1], np.concatenate(stamps), np.concatenate(kinds), np.concatenate(final), np.concatenate(redundant),
+            np.concatenate(poses), session,
+        )  # fmt: skip
