@@ -1,0 +1,63 @@
+"""Arguments that ``vli run`` and ``vli replay`` share."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from vli_bringup.settings import Settings, load_settings
+from vli_common.types import Mode
+from vli_driver.bag import BagTopics
+
+_TOPICS = {"image": "image_topic", "imu": "imu_topic", "camera_info": "camera_info_topic", "exposure": "exposure_topic"}
+"""Name after ``--topic`` → parameter of the driver."""
+
+
+def add_scan_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add bag, calibration, output, mode, parameters and the choice of topics and time."""
+    parser.add_argument("bag", metavar="BAG", type=Path, help="rosbag2 directory or bare .mcap")
+    parser.add_argument("--calib", metavar="C", type=Path, required=True, help="calibration file")
+    parser.add_argument("--imu-calib", metavar="F", type=Path, help="Kalibr's separate IMU file")
+    parser.add_argument("--out", metavar="DIR", type=Path, help="results (default: results/STAMP, and the link results/latest)")
+    parser.add_argument("--overwrite", action="store_true", help="replace the results in DIR")
+    modes = [mode.value for mode in Mode]
+    parser.add_argument(
+        "--mode", choices=modes, default=modes[0], help="all | no window-to-map | no laser | no IMU (default: %(default)s)"
+    )
+    parser.add_argument("--config", metavar="F", type=Path, help="parameters, in the form of config/vli.yaml")
+    parser.add_argument("--set", metavar="STAGE.KEY=VALUE", action="append", default=[], help="one parameter; may be repeated")
+    parser.add_argument("--start", metavar="S", type=_seconds, default=0.0, help="skip the first S seconds")
+    parser.add_argument("--duration", metavar="D", type=_seconds, help="stop after D seconds")
+    parser.add_argument(
+        "--topic", metavar="NAME=/TOPIC", type=_topic, action="append", default=[], help=f"NAME is one of {', '.join(_TOPICS)}"
+    )
+
+
+def scan_settings(args: argparse.Namespace) -> Settings:
+    """Return the settings that ``--config``, ``--set`` and ``--topic`` ask for, the later ones first in rank.
+
+    Raises:
+        ConfigError: unknown names or invalid values, all of them at once.
+    """
+    topics = [f"driver.{_TOPICS[name]}={topic}" for name, topic in args.topic]
+    return load_settings(args.config, [*args.set, *topics])
+
+
+def bag_topics(settings: Settings, mode: Mode) -> BagTopics:
+    """Return the topics to read from a bag."""
+    driver = settings.driver
+    return BagTopics(driver.image_topic, driver.imu_topic, driver.camera_info_topic, driver.exposure_topic, mode.uses_imu)
+
+
+def _seconds(text: str) -> float:
+    value = float(text)
+    if not 0.0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"'{text}', expected seconds, 0 or more")
+    return value
+
+
+def _topic(text: str) -> tuple[str, str]:
+    name, _, topic = text.partition("=")
+    if name not in _TOPICS or not topic.startswith("/"):
+        raise argparse.ArgumentTypeError(f"'{text}', expected one of {', '.join(f'{key}=/name' for key in _TOPICS)}")
+    return name, topic
