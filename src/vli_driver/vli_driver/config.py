@@ -54,15 +54,18 @@ class StripeConfig:
         doc="columns: one point per image column (stripe roughly horizontal), rows: one per row; auto: from the laser plane",
     )
     smoothing_px: float = parameter(1.0, unit="px", minimum=0.3, maximum=5.0, doc="sigma of the Gaussian across the stripe before the peak is sought")
-    half_window_px: int = parameter(
-        7, unit="px", minimum=3, maximum=20, doc="centre of mass over this many pixels each side, about 3.5 sigma of the stripe; more: noisier"
+    window_sigmas: float = parameter(
+        3.5, minimum=2.0, maximum=6.0, doc="half the widest window of the centre of mass, in sigmas of the line; wider: noisier, narrower: biased"
     )
     min_snr: float = parameter(
         6.0, minimum=3.0, maximum=50.0, doc="smoothed peak above the background in sigmas of its noise; lower: finds dimmer stripes and false ones"
     )
     min_peak: float = parameter(10.0, unit="grey levels", minimum=1.0, maximum=200.0, doc="smoothed peak above the background")
     max_width_px: float = parameter(
-        12.0, unit="px", minimum=2.0, maximum=60.0, doc="width at half maximum beyond which a peak is no laser line"
+        20.0, unit="px", minimum=2.0, maximum=100.0, doc="width at half height beyond which a peak is no laser line"
+    )
+    min_colour_ratio: float = parameter(
+        1.3, minimum=0.0, maximum=10.0, doc="light in the laser's channel over that in the others, in colour images; 0 for a white line"
     )
     ambiguity: float = parameter(
         0.6, minimum=0.1, maximum=1.0, doc="a second peak of this share of the first makes a column ambiguous unless its neighbours decide"
@@ -73,6 +76,6 @@ class StripeConfig:
     range_margin: float = parameter(
         0.1, minimum=0.0, maximum=1.0, doc="share by which the searched band exceeds laser0.range_m on either side"
     )
-    speckle: float = parameter(
-        0.08, unit="px", minimum=0.0, maximum=1.0, doc="floor of the sub-pixel error from laser speckle and calibration"
+    sigma_floor_px: float = parameter(
+        0.02, unit="px", minimum=0.0, maximum=1.0, doc="least error of a point, whatever its noise says: what the lens model leaves"
     )

@@ -1,0 +1,318 @@
+"""Inner loops of the stripe detector.
+
+A *profile* is one image column (or row) across the stripe; ``profiles`` is (N, M, C) uint8: N profiles of M samples in C channels.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+CANDIDATES = 2
+"""Peaks kept per profile: the highest, and the next one apart from it."""
+_BACKGROUND_STEP = 8
+_NOISE_STEP = 8
+_LEAST_NOISE = 0.5
+_ANNULUS = 5
+"""Samples either side of the window that tell the local background."""
+_PASSES = 2
+_FWHM = 2.3548
+_SHOT_GAIN = 0.1
+"""Variance per grey level of signal: some ten electrons to a grey level, as small 8-bit sensors have."""
+_UNEVEN = 0.15
+_MAX_MISSING = 2
+"""Missing points that do not end a segment."""
+
+
+@njit(cache=True)
+def noise_level(profiles, channel):  # type: ignore[no-untyped-def]
+    """Return the noise of one sample in grey levels: from the median difference of neighbours, which structure hardly moves."""
+    histogram = np.zeros(256, np.int64)
+    for i in range(0, profiles.shape[0], _NOISE_STEP):
+        for j in range(profiles.shape[1] - 1):
+            histogram[abs(np.int64(profiles[i, j + 1, channel]) - np.int64(profiles[i, j, channel]))] += 1
+    half = 0.5 * histogram.sum()
+    below = 0.0
+    for level in range(256):
+        if below + histogram[level] >= half:
+            # Differences are whole numbers: bin 0 is half as wide as the others.
+            share = (half - below) / max(histogram[level], 1)
+            median = 0.5 * share if level == 0 else level - 0.5 + share
+            return max(median / (0.6745 * np.sqrt(2.0)), _LEAST_NOISE)
+        below += histogram[level]
+    return _LEAST_NOISE
+
+
+@njit(cache=True)
+def channel_strength(profiles, first, last):  # type: ignore[no-untyped-def]
+    """Return for each channel the sum over every eighth profile of how far its brightest sample exceeds the mean."""
+    strength = np.zeros(profiles.shape[2])
+    for i in range(0, profiles.shape[0], _BACKGROUND_STEP):
+        for c in range(profiles.shape[2]):
+            total, best = 0.0, 0
+            for j in range(first[i], last[i]):
+                total += profiles[i, j, c]
+                best = max(best, profiles[i, j, c])
+            if last[i] > first[i]:
+                strength[c] += best - total / (last[i] - first[i])
+    return strength
+
+
+@njit(cache=True)
+def _median(values, count):  # type: ignore[no-untyped-def]
+    """Return the median of the first ``count`` values (insertion sort in place: they are few)."""
+    for i in range(1, count):
+        value = values[i]
+        j = i - 1
+        while j >= 0 and values[j] > value:
+            values[j + 1] = values[j]
+            j -= 1
+        values[j + 1] = value
+    return values[count // 2]
+
+
+@njit(cache=True)
+def _smooth(line, weights, out):  # type: ignore[no-untyped-def]
+    """Convolve ``line`` with the symmetric kernel whose half is ``weights``; the ends are repeated."""
+    count, reach = len(line), len(weights) - 1
+    for j in range(count):
+        out[j] = weights[0] * line[j]
+    for k in range(1, reach + 1):
+        for j in range(reach, count - reach):
+            out[j] += weights[k] * (line[j - k] + line[j + k])
+        for j in range(min(reach, count)):
+            out[j] += weights[k] * (line[max(j - k, 0)] + line[min(j + k, count - 1)])
+        for j in range(max(count - reach, reach), count):
+            out[j] += weights[k] * (line[max(j - k, 0)] + line[min(j + k, count - 1)])
+
+
+@njit(cache=True)
+def _extent(smooth, peak, level):  # type: ignore[no-untyped-def]
+    """Return where the smoothed profile falls below ``level`` left and right of ``peak``, between samples."""
+    left, last = peak, len(smooth) - 1
+    while left > 0 and smooth[left - 1] >= level:
+        left -= 1
+    right = peak
+    while right < last and smooth[right + 1] >= level:
+        right += 1
+    low, high = float(left), float(right)
+    if left > 0:
+        low -= (smooth[left] - level) / max(smooth[left] - smooth[left - 1], 1e-6)
+    if right < last:
+        high += (smooth[right] - level) / max(smooth[right] - smooth[right + 1], 1e-6)
+    return low, high
+
+
+@njit(cache=True)
+def find_peaks(profiles, channel, first, last, weights, threshold):  # type: ignore[no-untyped-def]
+    """Find the highest smoothed peaks of each profile.
+
+    Args:
+        profiles: (N, M, C) uint8.
+        channel: where the laser is seen.
+        first, last: (N,) int64, peaks are sought in [first, last).
+        weights: (K,) float32, half of the smoothing kernel.
+        threshold: least height above the profile's background.
+
+    Returns:
+        (N, 2, 3) float64: low and high end of the peak at half height, and the height; height zero where there is none.
+    """
+    count, samples = profiles.shape[0], profiles.shape[1]
+    found = np.zeros((count, CANDIDATES, 3))
+    line, smooth = np.empty(samples, np.float32), np.empty(samples, np.float32)
+    few = np.empty(samples // _BACKGROUND_STEP + 1, np.float32)
+    for i in range(count):
+        if last[i] - first[i] < 3:
+            continue
+        for j in range(samples):
+            line[j] = profiles[i, j, channel]
+        _smooth(line, weights, smooth)
+        number = 0
+        for j in range(first[i], last[i], _BACKGROUND_STEP):
+            few[number] = line[j]
+            number += 1
+        background = _median(few, number)
+        low, high = -1.0, -1.0
+        for k in range(CANDIDATES):
+            peak, best = -1, background + threshold
+            for j in range(first[i], last[i]):
+                if smooth[j] > best and (k == 0 or j < low - 1 or j > high + 1):
+                    peak, best = j, smooth[j]
+            if peak < 0:
+                break
+            # The flank of the first peak, cut off at its half height, is no second one.
+            if k and (smooth[max(peak - 1, 0)] > best or smooth[min(peak + 1, samples - 1)] > best):
+                break
+            low, high = _extent(smooth, peak, background + 0.5 * (best - background))
+            found[i, k, 0], found[i, k, 1], found[i, k, 2] = low, high, best - background
+    return found
+
+
+@njit(cache=True)
+def _mean(profiles, i, channel, first, last):  # type: ignore[no-untyped-def]
+    """Return the mean of the samples [first, last) that exist, NaN where none does."""
+    total, count = 0.0, 0
+    for j in range(max(first, 0), min(last, profiles.shape[1])):
+        total += profiles[i, j, channel]
+        count += 1
+    return total / count if count else np.nan
+
+
+@njit(cache=True)
+def _moments(profiles, i, channel, low, high, left, right):  # type: ignore[no-untyped-def]
+    """Return Σ I, Σ I x of the window [low, high] above a background from left to right; samples that it cuts count in part."""
+    total, weighted = 0.0, 0.0
+    for j in range(max(int(np.floor(low + 0.5)), 0), min(int(np.floor(high + 0.5)), profiles.shape[1] - 1) + 1):
+        inside = min(j + 0.5, high) - max(j - 0.5, low)
+        value = inside * (profiles[i, j, channel] - left - (right - left) * (j - low) / (high - low))
+        total += value
+        weighted += value * j
+    return total, weighted
+
+
+@njit(cache=True)
+def _sides(profiles, i, channel, centre, reach):  # type: ignore[no-untyped-def]
+    """Return the mean grey level just outside ``centre`` ± ``reach``, below and above."""
+    low, high = int(np.floor(centre - reach + 0.5)), int(np.floor(centre + reach + 0.5))
+    left = _mean(profiles, i, channel, low - _ANNULUS, low)
+    right = _mean(profiles, i, channel, high + 1, high + 1 + _ANNULUS)
+    return (right if np.isnan(left) else left), (left if np.isnan(right) else right)
+
+
+@njit(cache=True)
+def _spread(profiles, i, channel, centre, half, background, noise):  # type: ignore[no-untyped-def]
+    """Return Σ k² var(I_k) of sensor noise, Σ k² I_k² for speckle, and the highest I, in the window about ``centre``."""
+    sensor, speckle, top = 0.0, 0.0, 0.0
+    for j in range(max(int(centre - half + 0.5), 0), min(int(centre + half + 0.5), profiles.shape[1] - 1) + 1):
+        value = max(profiles[i, j, channel] - background, 0.0)
+        sensor += (j - centre) ** 2 * (noise**2 + _SHOT_GAIN * value)
+        speckle += ((j - centre) * value) ** 2
+        top = max(top, value)
+    return sensor, speckle, top
+
+
+@njit(cache=True)
+def _other_channels(profiles, i, channel, centre, half, reach):  # type: ignore[no-untyped-def]
+    """Return Σ I of the mean of the other channels in the same window, zero where there are none."""
+    total = 0.0
+    for c in range(profiles.shape[2]):
+        if c != channel:
+            left, right = _sides(profiles, i, c, centre, reach)
+            total += _moments(profiles, i, c, centre - half, centre + half, left, right)[0]
+    return max(total, 0.0) / max(profiles.shape[2] - 1, 1)
+
+
+@njit(cache=True)
+def locate(profiles, channel, peaks, smoothing, noise, threshold, window_sigmas, max_width):  # type: ignore[no-untyped-def]
+    """Return the centre of mass of each peak above its local background.
+
+    The window reaches to where a line of that width and height sinks into the noise, sigma √(2 ln(height / noise)), at most
+    ``window_sigmas``: further out it would only collect noise.
+
+    Args:
+        profiles: (N, M, C) uint8.
+        channel: where the laser is seen.
+        peaks: (N, 3), one for each profile as :func:`find_peaks` gives them.
+        smoothing: sigma of the smoothing, pixels.
+        noise: grey levels, of one sample.
+        threshold: least height above either side.
+        window_sigmas: the widest window.
+        max_width: pixels, wider peaks are no laser line.
+
+    Returns:
+        (N, 6) float64: centre, peak I, Σ I, Σ k² var(I_k) of sensor noise, Σ k² I_k² for speckle (k from the centre), Σ I of the other
+        channels' mean; NaN where there is no line.
+    """
+    out = np.full((len(peaks), 6), np.nan)
+    for i in range(len(peaks)):
+        low, high, height = peaks[i]
+        width = np.sqrt(max((high - low) ** 2 - (_FWHM * smoothing) ** 2, 1.0))
+        if not height > 0 or width > max_width:
+            continue
+        sigma = width / _FWHM
+        half = max(sigma * min(np.sqrt(2 * np.log(max(height / noise, 2.0))), window_sigmas), 0.5 * width + 1.5)
+        reach = max(half, window_sigmas * sigma)
+        centre, total, left, right = 0.5 * (low + high), 0.0, 0.0, 0.0
+        for _ in range(_PASSES):
+            left, right = _sides(profiles, i, channel, centre, reach)
+            # Sides this different belong to two surfaces, or one holds another line: the darker one is the background.
+            if abs(left - right) > max(4 * noise, _UNEVEN * height):
+                left = right = min(left, right)
+            total, weighted = _moments(profiles, i, channel, centre - half, centre + half, left, right)
+            if not total > 0 or abs(weighted / total - centre) > half:
+                total = 0.0
+                break
+            centre = weighted / total
+        if not total > 0:
+            continue
+        sensor, speckle, top = _spread(profiles, i, channel, centre, half, 0.5 * (left + right), noise)
+        sides = _sides(profiles, i, channel, centre, reach)
+        if top - (max(sides[0], sides[1]) - 0.5 * (left + right)) < threshold:
+            continue
+        out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4] = centre, top, total, sensor, speckle
+        out[i, 5] = _other_channels(profiles, i, channel, centre, half, reach)
+    return out
+
+
+@njit(cache=True)
+def choose_chain(found, ambiguity, max_jump):  # type: ignore[no-untyped-def]
+    """Choose one peak per profile so that the line jumps least, the brighter one where that does not decide (Viterbi).
+
+    Returns:
+        (N, 3) peaks chosen, and (N,) bool: a second peak of more than ``ambiguity`` of the first was there.
+    """
+    count = len(found)
+    cost, back = np.zeros((count, CANDIDATES)), np.zeros((count, CANDIDATES), np.int64)
+    ambiguous = np.zeros(count, np.bool_)
+    for i in range(count):
+        ambiguous[i] = found[i, 1, 2] > ambiguity * found[i, 0, 2] and found[i, 0, 2] > 0
+        for k in range(CANDIDATES):
+            if k and not ambiguous[i]:
+                cost[i, k] = np.inf
+                continue
+            best, source = np.inf, 0
+            for m in range(CANDIDATES):
+                jump = 0.0
+                if i and found[i, k, 2] > 0 and found[i - 1, m, 2] > 0:
+                    apart = 0.5 * abs(found[i, k, 0] + found[i, k, 1] - found[i - 1, m, 0] - found[i - 1, m, 1])
+                    jump = 1.0 if apart >= max_jump else 0.0
+                before = cost[i - 1, m] if i else 0.0
+                if before + jump < best:
+                    best, source = before + jump, m
+            dimmer = np.log(found[i, 0, 2] / found[i, k, 2]) if k else 0.0
+            cost[i, k], back[i, k] = best + dimmer, source
+    chosen = np.zeros((count, 3))
+    state = 0
+    if count:
+        state = int(np.argmin(cost[count - 1]))
+    for i in range(count - 1, -1, -1):
+        chosen[i] = found[i, state]
+        state = back[i, state]
+    return chosen, ambiguous
+
+
+@njit(cache=True)
+def keep_segments(located, ambiguous, max_jump, min_points, min_colour_ratio):  # type: ignore[no-untyped-def]
+    """Return (N,) bool: the profiles whose point lies on a segment that is long, unambiguous and coloured enough."""
+    count = len(located)
+    keep = np.zeros(count, np.bool_)
+    i = 0
+    while i < count:
+        if np.isnan(located[i, 0]):
+            i += 1
+            continue
+        last, end, number, doubtful, own, other = i, i + 1, 0, 0, 0.0, 0.0
+        for j in range(i, count):
+            if np.isnan(located[j, 0]):
+                continue
+            if j - last > _MAX_MISSING + 1 or abs(located[j, 0] - located[last, 0]) >= max_jump * max(j - last, 1):
+                break
+            last, end, number = j, j + 1, number + 1
+            doubtful += ambiguous[j]
+            own += located[j, 2]
+            other += located[j, 5]
+        if number >= min_points and 2 * doubtful <= number and own >= min_colour_ratio * other:
+            for j in range(i, end):
+                keep[j] = not np.isnan(located[j, 0])
+        i = end
+    return keep
