@@ -46,149 +46,161 @@ class Quadratic:
 
 
 @numba.njit(cache=True)
-def _residual(anchor_r, anchor_t, ray, rho, r, t, out):  # type: ignore[no-untyped-def]
-    """Write the landmark in frame (r, t) to ``out``; return the rotation from the anchor into that frame."""
-    relative = r.T @ anchor_r
-    p = np.array([ray[0] / rho, ray[1] / rho, 1.0 / rho])
-    out[:] = relative @ p + r.T @ (anchor_t - t)
-    return relative
+def _relative_poses(rotations, translations):  # type: ignore[no-untyped-def]
+    """Return R_ja (K, K, 3, 3) and t_ja (K, K, 3): points of frame a in frame j."""
+    count = len(rotations)
+    r, t = np.zeros((count, count, 3, 3)), np.zeros((count, count, 3))
+    for j in range(count):
+        for a in range(count):
+            for m in range(3):
+                for k in range(3):
+                    t[j, a, m] += rotations[j, k, m] * (translations[a, k] - translations[j, k])
+                    for n in range(3):
+                        r[j, a, m, n] += rotations[j, k, m] * rotations[a, k, n]
+    return r, t
 
 
 @numba.njit(cache=True)
-def refine_depths(  # type: ignore[no-untyped-def]
-    rotations, translations, use, anchor, anchor_ray, rho, prior, rays, sigma, depth, depth_sigma, cauchy, limits, iterations
+def _refine(  # type: ignore[no-untyped-def]
+    relative_r, relative_t, use, anchor, anchor_ray, rho, prior, rays, sigma, depth, depth_sigma, cauchy, limits, iterations
 ):
     """Minimise the cost of every landmark over its own ρ, poses fixed; writes ``rho`` and returns its information (L,)."""
     count, slots = sigma.shape
     information = np.zeros(count)
-    x = np.empty(3)
     for i in range(count):
         if not use[i]:
             continue
         a = anchor[i]
-        damping = 0.0
         for _ in range(iterations):
             h = 1.0 / prior[i, 1] ** 2
             g = (rho[i] - prior[i, 0]) * h
-            p = np.array([anchor_ray[i, 0] / rho[i], anchor_ray[i, 1] / rho[i], 1.0 / rho[i]])
+            z_a = 1.0 / rho[i]
             for j in range(slots):
-                if j != a and sigma[i, j] > 0:
-                    relative = _residual(rotations[a], translations[a], anchor_ray[i], rho[i], rotations[j], translations[j], x)
-                    d = -(relative @ p) / rho[i]
-                    if x[2] <= 1e-6:
-                        continue
-                    z = 1.0 / x[2]
-                    e0 = (x[0] * z - rays[i, j, 0]) / sigma[i, j]
-                    e1 = (x[1] * z - rays[i, j, 1]) / sigma[i, j]
-                    j0 = (d[0] - x[0] * z * d[2]) * z / sigma[i, j]
-                    j1 = (d[1] - x[1] * z * d[2]) * z / sigma[i, j]
-                    w = 1.0 / (1.0 + (e0 * e0 + e1 * e1) / cauchy**2)
+                seen, measured = j != a and sigma[i, j] > 0, depth_sigma[i, j] > 0
+                if not (seen or measured):
+                    continue
+                r, t = relative_r[j, a], relative_t[j, a]
+                d0 = (r[0, 0] * anchor_ray[i, 0] + r[0, 1] * anchor_ray[i, 1] + r[0, 2]) * z_a
+                d1 = (r[1, 0] * anchor_ray[i, 0] + r[1, 1] * anchor_ray[i, 1] + r[1, 2]) * z_a
+                d2 = (r[2, 0] * anchor_ray[i, 0] + r[2, 1] * anchor_ray[i, 1] + r[2, 2]) * z_a
+                depth_j = d2 + t[2]
+                if depth_j <= 1e-6:
+                    continue
+                z = 1.0 / depth_j
+                if seen:
+                    s = 1.0 / sigma[i, j]
+                    u, v = (d0 + t[0]) * z, (d1 + t[1]) * z
+                    e0, e1 = (u - rays[i, j, 0]) * s, (v - rays[i, j, 1]) * s
+                    # d(d)/dρ = −d / ρ
+                    j0, j1 = -(d0 - u * d2) * z * z_a * s, -(d1 - v * d2) * z * z_a * s
+                    w = 1.0 / (1.0 + (e0 * e0 + e1 * e1) / (cauchy * cauchy))
                     h += w * (j0 * j0 + j1 * j1)
                     g += w * (j0 * e0 + j1 * e1)
-                if depth_sigma[i, j] > 0:
-                    relative = _residual(rotations[a], translations[a], anchor_ray[i], rho[i], rotations[j], translations[j], x)
-                    d = -(relative @ p) / rho[i]
-                    if x[2] <= 1e-6:
-                        continue
-                    e = (1.0 / x[2] - depth[i, j]) / depth_sigma[i, j]
-                    jd = -d[2] / (x[2] * x[2]) / depth_sigma[i, j]
-                    w = 1.0 / (1.0 + e * e / cauchy**2)
+                if measured:
+                    s = 1.0 / depth_sigma[i, j]
+                    e = (z - depth[i, j]) * s
+                    jd = d2 * z * z * z_a * s
+                    w = 1.0 / (1.0 + e * e / (cauchy * cauchy))
                     h += w * jd * jd
                     g += w * jd * e
             information[i] = h
-            step = -g / (h * (1.0 + damping))
-            # A long step is one out of the quadratic's reach: ρ is only allowed to change by a third at a time.
+            # A long step is one out of the quadratic's reach: ρ may only change by a third at a time.
             bound = rho[i] / 3.0
-            step = min(max(step, -bound), bound)
+            step = min(max(-g / h, -bound), bound)
             rho[i] = min(max(rho[i] + step, limits[0]), limits[1])
-            if abs(step) < 1e-6 * rho[i]:
+            if abs(step) < 1e-7 * rho[i]:
                 break
     return information
 
 
 @numba.njit(cache=True)
-def _accumulate_pair(hessian, gradient, coupling, ja, jj, a, j, e, jr, w):  # type: ignore[no-untyped-def]
-    """Add one residual row with Jacobians on anchor pose, frame pose and ρ."""
-    for m in range(6):
-        wa, wj = w * ja[m], w * jj[m]
-        gradient[6 * a + m] += wa * e
-        gradient[6 * j + m] += wj * e
-        coupling[6 * a + m] += wa * jr
-        coupling[6 * j + m] += wj * jr
-        for n in range(6):
-            hessian[6 * a + m, 6 * a + n] += wa * ja[n]
-            hessian[6 * j + m, 6 * j + n] += wj * jj[n]
-            hessian[6 * a + m, 6 * j + n] += wa * jj[n]
-            hessian[6 * j + m, 6 * a + n] += wj * ja[n]
+def _add_row(hessian, gradient, coupling, row, e, w, jr, a, j):  # type: ignore[no-untyped-def]
+    """Add one residual row: ``row`` holds its Jacobian on the anchor pose, then on the frame's pose; ``jr`` that on ρ."""
+    for m in range(12):
+        at_m = 6 * a + m if m < 6 else 6 * j + m - 6
+        weighted = w * row[m]
+        gradient[at_m] += weighted * e
+        coupling[at_m] += weighted * jr
+        for n in range(m, 12):
+            at_n = 6 * a + n if n < 6 else 6 * j + n - 6
+            # Only one triangle is filled; the caller mirrors it.
+            if at_m <= at_n:
+                hessian[at_m, at_n] += weighted * row[n]
+            else:
+                hessian[at_n, at_m] += weighted * row[n]
 
 
 @numba.njit(cache=True)
 def _condense(  # type: ignore[no-untyped-def]
-    rotations, translations, use, anchor, anchor_ray, rho, prior, rays, sigma, depth, depth_sigma, cauchy, hessian, gradient
+    relative_r, relative_t, use, anchor, anchor_ray, rho, prior, rays, sigma, depth, depth_sigma, cauchy, hessian, gradient
 ):
     count, slots = sigma.shape
-    x, ja, jj, row = np.empty(3), np.empty(6), np.empty(6), np.empty(3)
+    row, coupling = np.zeros(12), np.empty(6 * slots)
     cost = 0.0
     for i in range(count):
         if not use[i]:
             continue
         a = anchor[i]
         first, last = a, a
-        coupling = np.zeros(6 * slots)
+        coupling[:] = 0.0
         h = 1.0 / prior[i, 1] ** 2
         g = (rho[i] - prior[i, 0]) * h
         cost += g * (rho[i] - prior[i, 0])
-        p = np.array([anchor_ray[i, 0] / rho[i], anchor_ray[i, 1] / rho[i], 1.0 / rho[i]])
+        z_a = 1.0 / rho[i]
+        p0, p1, p2 = anchor_ray[i, 0] * z_a, anchor_ray[i, 1] * z_a, z_a
         for j in range(slots):
             seen, measured = j != a and sigma[i, j] > 0, depth_sigma[i, j] > 0
             if not (seen or measured):
                 continue
             first, last = min(first, j), max(last, j)
-            relative = _residual(rotations[a], translations[a], anchor_ray[i], rho[i], rotations[j], translations[j], x)
-            if x[2] <= 1e-6:
+            r, t = relative_r[j, a], relative_t[j, a]
+            x0 = r[0, 0] * p0 + r[0, 1] * p1 + r[0, 2] * p2 + t[0]
+            x1 = r[1, 0] * p0 + r[1, 1] * p1 + r[1, 2] * p2 + t[1]
+            x2 = r[2, 0] * p0 + r[2, 1] * p1 + r[2, 2] * p2 + t[2]
+            if x2 <= 1e-6:
                 continue
-            z = 1.0 / x[2]
+            z = 1.0 / x2
+            u, v = x0 * z, x1 * z
             for k in range(3):
                 if k < 2 and not seen or k == 2 and not measured:
                     continue
                 if k < 2:
                     s = 1.0 / sigma[i, j]
-                    e = (x[k] * z - rays[i, j, k]) * s
-                    row[:] = 0.0
-                    row[k] = z * s
-                    row[2] = -x[k] * z * z * s
-                    e0 = (x[0] * z - rays[i, j, 0]) * s
-                    e1 = (x[1] * z - rays[i, j, 1]) * s
-                    squared = e0 * e0 + e1 * e1
+                    e0, e1 = (u - rays[i, j, 0]) * s, (v - rays[i, j, 1]) * s
+                    squared, e = e0 * e0 + e1 * e1, e0 if k == 0 else e1
+                    c0, c1, c2 = (z * s, 0.0, -u * z * s) if k == 0 else (0.0, z * s, -v * z * s)
                 else:
                     s = 1.0 / depth_sigma[i, j]
                     e = (z - depth[i, j]) * s
-                    row[:] = 0.0
-                    row[2] = -z * z * s
                     squared = e * e
-                w = 1.0 / (1.0 + squared / cauchy**2)
-                b = relative.T @ row
-                # d x_j / d ω_a = −R_ja [p]×, d/d v_a = R_ja; d x_j / d ω_j = [x]×, d/d v_j = −I
-                ja[0], ja[1], ja[2] = p[1] * b[2] - p[2] * b[1], p[2] * b[0] - p[0] * b[2], p[0] * b[1] - p[1] * b[0]
-                ja[3:] = b
-                jj[0], jj[1], jj[2] = x[2] * row[1] - x[1] * row[2], x[0] * row[2] - x[2] * row[0], x[1] * row[0] - x[0] * row[1]
-                jj[3:] = -row
-                jr = -(b[0] * p[0] + b[1] * p[1] + b[2] * p[2]) / rho[i]
-                if j == a:
-                    # The anchor's own depth does not depend on any pose.
-                    ja[:] = 0.0
-                    jj[:] = 0.0
-                _accumulate_pair(hessian, gradient, coupling, ja, jj, a, j, e, jr, w)
+                    c0, c1, c2 = 0.0, 0.0, -z * z * s
+                w = 1.0 / (1.0 + squared / (cauchy * cauchy))
+                cost += cauchy * cauchy * np.log1p(squared / (cauchy * cauchy)) * (0.5 if k < 2 else 1.0)
+                b0 = r[0, 0] * c0 + r[1, 0] * c1 + r[2, 0] * c2
+                b1 = r[0, 1] * c0 + r[1, 1] * c1 + r[2, 1] * c2
+                b2 = r[0, 2] * c0 + r[1, 2] * c1 + r[2, 2] * c2
+                jr = -(b0 * p0 + b1 * p1 + b2 * p2) * z_a
                 h += w * jr * jr
                 g += w * jr * e
-                cost += cauchy**2 * np.log1p(squared / cauchy**2) * (0.5 if k < 2 else 1.0)
+                if j == a:
+                    # The anchor's own depth does not depend on any pose.
+                    continue
+                # d x_j / d[ω, v]_a = [−R_ja [p]×, R_ja]; d x_j / d[ω, v]_j = [[x]×, −I]
+                row[0], row[1], row[2] = p1 * b2 - p2 * b1, p2 * b0 - p0 * b2, p0 * b1 - p1 * b0
+                row[3], row[4], row[5] = b0, b1, b2
+                row[6], row[7], row[8] = x2 * c1 - x1 * c2, x0 * c2 - x2 * c0, x1 * c0 - x0 * c1
+                row[9], row[10], row[11] = -c0, -c1, -c2
+                _add_row(hessian, gradient, coupling, row, e, w, jr, a, j)
+        inverse = 1.0 / h
         for m in range(6 * first, 6 * last + 6):
-            if coupling[m] == 0.0:
-                continue
-            c = coupling[m] / h
-            gradient[m] -= c * g
-            for n in range(6 * first, 6 * last + 6):
-                hessian[m, n] -= c * coupling[n]
+            c = coupling[m] * inverse
+            if c != 0.0:
+                gradient[m] -= c * g
+                for n in range(m, 6 * last + 6):
+                    hessian[m, n] -= c * coupling[n]
+    for m in range(6 * slots):
+        for n in range(m + 1, 6 * slots):
+            hessian[n, m] = hessian[m, n]
     return cost
 
 
@@ -218,8 +230,9 @@ def refine(
     rotations, translations = np.ascontiguousarray(T_map_camera[:, :3, :3]), np.ascontiguousarray(T_map_camera[:, :3, 3])
     k = len(rotations)
     m = landmarks
-    information: FloatArray = refine_depths(
-        rotations, translations, use, m.anchor, m.anchor_ray, m.rho, m.prior, m.rays[:, :k], m.sigma[:, :k], m.depth[:, :k],
+    relative_r, relative_t = _relative_poses(rotations, translations)
+    information: FloatArray = _refine(
+        relative_r, relative_t, use, m.anchor, m.anchor_ray, m.rho, m.prior, m.rays[:, :k], m.sigma[:, :k], m.depth[:, :k],
         m.depth_sigma[:, :k], cauchy, limits, iterations,
     )  # fmt: skip
     return information
@@ -231,8 +244,9 @@ def condense(landmarks: LandmarkArrays, T_map_camera: FloatArray, use: BoolArray
     k = len(rotations)
     hessian, gradient = np.zeros((6 * k, 6 * k)), np.zeros(6 * k)
     m = landmarks
+    relative_r, relative_t = _relative_poses(rotations, translations)
     cost = _condense(
-        rotations, translations, use, m.anchor, m.anchor_ray, m.rho, m.prior, m.rays[:, :k], m.sigma[:, :k], m.depth[:, :k],
+        relative_r, relative_t, use, m.anchor, m.anchor_ray, m.rho, m.prior, m.rays[:, :k], m.sigma[:, :k], m.depth[:, :k],
         m.depth_sigma[:, :k], cauchy, hessian, gradient,
     )  # fmt: skip
     return Quadratic(hessian, gradient, float(cost))

@@ -48,7 +48,7 @@ def _solve(rotation, translation, points, spread, rays, sigma, prior, cauchy, it
     start_r, start_t = rotation.copy(), translation.copy()
     h, g = np.zeros((6, 6)), np.zeros(6)
     inliers, squares, done = 0, 0.0, 0
-    j0, j1, delta = np.empty(6), np.empty(6), np.empty(6)
+    j0, j1, delta, x, d = np.empty(6), np.empty(6), np.empty(6), np.empty(3), np.empty(3)
     for step in range(iterations):
         done = step + 1
         delta[:3] = _log_so3(start_r.T @ rotation)
@@ -56,15 +56,17 @@ def _solve(rotation, translation, points, spread, rays, sigma, prior, cauchy, it
         h[:] = prior
         g[:] = prior @ delta
         inliers, squares = 0, 0.0
-        rt = rotation.T
         for i in range(len(points)):
-            x = rt @ (points[i] - translation)
+            for m in range(3):
+                x[m], d[m] = 0.0, 0.0
+                for n in range(3):
+                    x[m] += rotation[n, m] * (points[i, n] - translation[n])
+                    d[m] += rotation[n, m] * spread[i, n]
             if x[2] <= 1e-6:
                 continue
             z = 1.0 / x[2]
             u, v = x[0] * z, x[1] * z
             e0, e1 = u - rays[i, 0], v - rays[i, 1]
-            d = rt @ spread[i]
             d0, d1 = (d[0] - u * d[2]) * z, (d[1] - v * d[2]) * z
             # Inverse of σ² I + d dᵀ (Sherman–Morrison).
             s2 = sigma[i] * sigma[i]

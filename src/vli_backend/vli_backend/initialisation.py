@@ -97,11 +97,31 @@ def _gyro_bias(T_world_imu: FloatArray, measurements: list[gtsam.PreintegratedCo
     base = measurements[0].biasHatVector()[3:]
     for k, pim in enumerate(measurements):
         measured = T_world_imu[k, :3, :3].T @ T_world_imu[k + 1, :3, :3]
-        rows.append(pim.delRdelBiasOmega())
-        errors.append(so3_log(pim.deltaRij().matrix().T @ measured))
+        rows.append(_rotation_bias_jacobian(pim))
+        errors.append(so3_log(measured) - so3_log(pim.deltaRij().matrix()))
     solution = np.linalg.lstsq(np.concatenate(rows), np.concatenate(errors), rcond=None)[0]
     result: FloatArray = base + solution
     return result
+
+
+def _corrected_delta(
+    pim: gtsam.PreintegratedCombinedMeasurements, gyro_bias: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return ΔR (3, 3), Δp, Δv (3,) for a gyro bias: a prediction from the origin at rest, less the fall."""
+    bias = gtsam.imuBias.ConstantBias(pim.biasHatVector()[:3], gyro_bias)
+    nav = pim.predict(gtsam.NavState(), bias)
+    fall, t = np.array([0.0, 0.0, -GRAVITY]), pim.deltaTij()
+    return nav.pose().rotation().matrix(), nav.pose().translation() - 0.5 * t * t * fall, nav.velocity() - t * fall
+
+
+def _rotation_bias_jacobian(pim: gtsam.PreintegratedCombinedMeasurements) -> FloatArray:
+    """Return d Log(ΔR) / d gyro bias (3, 3), by differences: GTSAM keeps the exact one to itself."""
+    step, base = 1e-4, pim.biasHatVector()[3:]
+    columns = []
+    for axis in np.eye(3):
+        ahead, behind = (so3_log(_corrected_delta(pim, base + sign * step * axis)[0]) for sign in (1.0, -1.0))
+        columns.append((ahead - behind) / (2 * step))
+    return np.stack(columns, axis=1)
 
 
 def _velocities_and_gravity(
@@ -115,9 +135,7 @@ def _velocities_and_gravity(
     rows, values = [], []
     for k, pim in enumerate(measurements):
         t = pim.deltaTij()
-        bias = gtsam.imuBias.ConstantBias(pim.biasHatVector()[:3], gyro_bias)
-        corrected = pim.biasCorrectedDelta(bias)
-        delta_p, delta_v = corrected[3:6], corrected[6:9]
+        _, delta_p, delta_v = _corrected_delta(pim, gyro_bias)
         r_i, p_i, p_j = T_world_imu[k, :3, :3], T_world_imu[k, :3, 3], T_world_imu[k + 1, :3, 3]
         position, velocity = np.zeros((3, width)), np.zeros((3, width))
         position[:, 3 * k : 3 * k + 3] = t * np.eye(3)

@@ -20,6 +20,13 @@ from vli_common.arrays import FloatArray
 from vli_common.errors import VliError
 
 
+_UNMEASURED_WALK = (1e-2, 1e-3)
+"""Bias walk across a gap without IMU, accelerometer m/s³/√Hz and gyro rad/s²/√Hz: loose, yet not singular."""
+
+_UNMEASURED_VELOCITY = 0.1
+"""Sigma of the velocity at a keyframe without IMU, m/s: a hand in a confined space is slower."""
+
+
 class SmootherError(VliError):
     """The optimiser failed (indeterminate system); the window must be damped or started anew."""
 
@@ -90,7 +97,7 @@ class GtsamSmoother:
         tolerance: largest pose step (rad, m) at which the iteration stops.
     """
 
-    def __init__(self, keyframes: int, tolerance: tuple[float, float] = (1e-6, 1e-7)) -> None:
+    def __init__(self, keyframes: int, tolerance: tuple[float, float] = (1e-5, 1e-6)) -> None:
         self._keyframes = keyframes
         self._tolerance = tolerance
         parameters = gtsam.LevenbergMarquardtParams()
@@ -102,7 +109,9 @@ class GtsamSmoother:
         self._count = 0
         self._container: gtsam.LinearContainerFactor | None = None
         self._estimate = gtsam.Values()
-        self._waiting: tuple[gtsam.NonlinearFactorGraph, gtsam.Values, dict[int, float]] | None = None
+        # New keyframes, held back until a container is there: without residuals of their own their poses may be undetermined.
+        self._new_factors, self._new_values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        self._new_stamps: dict[int, float] = {}
 
     def start(self, state: KeyframeState, prior: StatePrior) -> None:
         """See :meth:`Smoother.start`."""
@@ -120,18 +129,19 @@ class GtsamSmoother:
     def add_keyframe(self, state: KeyframeState, imu: gtsam.PreintegratedCombinedMeasurements | None, elapsed_s: float) -> None:
         """See :meth:`Smoother.add_keyframe`."""
         last, new = self._first + self._count - 1, self._first + self._count
-        values, graph = gtsam.Values(), gtsam.NonlinearFactorGraph()
-        _insert(values, new, gtsam.Pose3(state.T_map_imu), state)
+        graph = self._new_factors
+        _insert(self._new_values, new, gtsam.Pose3(state.T_map_imu), state)
+        _insert(self._estimate, new, gtsam.Pose3(state.T_map_imu), state)
         if imu is not None:
             graph.add(gtsam.CombinedImuFactor(X(last), V(last), X(new), V(new), B(last), B(new), imu))
         else:
-            walk = gtsam.noiseModel.Diagonal.Sigmas(np.repeat([1e-2, 1e-3], 3) * max(elapsed_s, 1e-3) ** 0.5)
+            walk = gtsam.noiseModel.Diagonal.Sigmas(np.repeat(_UNMEASURED_WALK, 3) * max(elapsed_s, 1e-3) ** 0.5)
             graph.add(gtsam.BetweenFactorConstantBias(B(last), B(new), gtsam.imuBias.ConstantBias(), walk))
-            graph.add(gtsam.PriorFactorVector(V(new), state.velocity, gtsam.noiseModel.Isotropic.Sigma(3, 0.1)))
+            loose = gtsam.noiseModel.Isotropic.Sigma(3, _UNMEASURED_VELOCITY)
+            graph.add(gtsam.PriorFactorVector(V(new), state.velocity, loose))
+        self._new_stamps |= {key: float(last) for key in (X(last), V(last), B(last))}
+        self._new_stamps |= {key: float(last) for key in (X(new), V(new), B(new))}
         self._count += 1
-        # Held back until the first container is there: without residuals of its own the new pose may be undetermined.
-        self._waiting = (graph, values, {key: float(last) for i in (last, new) for key in (X(i), V(i), B(i))})
-        self._estimate.insert(values)
 
     def solve(self, condenser: Condenser, iterations: int) -> int:
         """See :meth:`Smoother.solve`."""
@@ -204,12 +214,11 @@ class GtsamSmoother:
         return gtsam.LinearContainerFactor(gtsam.HessianFactor(blocks), point)
 
     def _replace(self, container: gtsam.LinearContainerFactor) -> None:
-        graph, values, stamps = self._waiting or (gtsam.NonlinearFactorGraph(), gtsam.Values(), {})
-        self._waiting = None
-        graph.add(container)
+        self._new_factors.add(container)
         removed = [self._slot_of(self._container)] if self._container is not None else []
-        self._update(graph, values, stamps, removed)
+        self._update(self._new_factors, self._new_values, self._new_stamps, removed)
         self._container = container
+        self._new_factors, self._new_values, self._new_stamps = gtsam.NonlinearFactorGraph(), gtsam.Values(), {}
 
     def _slot_of(self, factor: gtsam.NonlinearFactor) -> int:
         factors = self._smoother.getFactors()
@@ -224,7 +233,7 @@ class GtsamSmoother:
         try:
             self._smoother.update(graph, values, stamps, list(removed))
             self._estimate = self._smoother.calculateEstimate()
-        except RuntimeError as error:
+        except (RuntimeError, ValueError) as error:
             raise SmootherError(_first_line(error)) from error
 
 
