@@ -120,7 +120,9 @@ def test_every_public_name_has_a_docstring():
 
 
 def test_inputs_are_not_checked_by_assert_and_nothing_is_pickled():
-    wrong = [f"{module}:{item.lineno} asserts" for module in MODULES for item in ast.walk(module.tree) if isinstance(item, ast.Assert)]
+    wrong = [
+        f"{module}:{item.lineno} asserts" for module in MODULES for item in ast.walk(module.tree) if isinstance(item, ast.Assert)
+    ]
     wrong += [
         f"{module}:{line} imports {name}"
         for module in MODULES

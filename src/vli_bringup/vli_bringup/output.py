@@ -38,7 +38,9 @@ class ResultsDirectory:
             _remove(self.partial)
             self.partial.mkdir(parents=True)
         except OSError as error:
-            raise OutputError(f"'{self.partial}' cannot be made ({error.strerror}); choose another place with --out DIR") from error
+            raise OutputError(
+                f"'{self.partial}' cannot be made ({error.strerror}); choose another place with --out DIR"
+            ) from error
         return self.partial
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:

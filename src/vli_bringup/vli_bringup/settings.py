@@ -124,7 +124,7 @@ def _node_parameters(name: str, content: Any) -> dict[str, Any]:
 
 
 def _load(text: str) -> Any:
-    return yaml.load(text, _Loader)  # noqa: S506 (a SafeLoader)
+    return yaml.load(text, _Loader)
 
 
 if __name__ == "__main__":

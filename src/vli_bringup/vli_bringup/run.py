@@ -1,0 +1,156 @@
+"""``vli run``: a bag to trajectories and a coloured map, offline and deterministic."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from tqdm import tqdm
+
+from vli_bringup.arguments import add_scan_arguments, bag_topics, scan_settings
+from vli_bringup.input_checks import check_input
+from vli_bringup.output import SUMMARY, ResultsDirectory
+from vli_bringup.pipeline import Pipeline, Stages
+from vli_bringup.recorder import Recorder
+from vli_bringup.settings import Settings, to_yaml
+from vli_bringup.warm_up import warm_up
+from vli_common.calibration import Calibration, load_calibration
+from vli_common.types import NANOSECONDS, EncodedImage, ImuSample, Mode
+from vli_driver.bag import BagReader
+from vli_mapping.render import write_views
+from vli_mapping.store import write_ply
+
+NEVER_TRACKED = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """Wall and processor time of a run, seconds.
+
+    Args:
+        startup_s: from the start of the command to the first message: imports, checks, compilation.
+        wall_s: from then until the map was complete; files are written after that.
+        cpu_s: of the process, over both.
+        bag_s: of the data that were read, by their stamps.
+    """
+
+    startup_s: float
+    wall_s: float
+    cpu_s: float
+    bag_s: float
+
+    def summary(self) -> dict[str, float]:
+        """Return the figures of ``summary.json``; the factor is bag seconds per wall second."""
+        figures = {
+            "startup_s": self.startup_s,
+            "wall_s": self.wall_s,
+            "cpu_s": self.cpu_s,
+            "realtime_factor": self.bag_s / self.wall_s if self.wall_s > 0 else 0.0,
+        }
+        return {name: round(value, 3) for name, value in figures.items()}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of ``vli run``."""
+    add_scan_arguments(parser)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run a bag and write the results; return 0, or 1 where tracking never started.
+
+    Raises:
+        VliError: nothing usable: bag, calibration, parameters or output directory.
+    """
+    mode = Mode(args.mode)
+    settings = scan_settings(args)
+    calibration = load_calibration(args.calib, mode, args.imu_calib)
+    topics = bag_topics(settings, mode)
+    warnings = check_input(BagReader(args.bag, topics), calibration, mode.uses_imu)
+    reader = BagReader(args.bag, topics, args.start, args.duration)
+    results = ResultsDirectory(args.out, args.overwrite)
+    with results as directory:
+        warm_up()
+        pipeline, recorder, clock = process(reader, calibration, settings, mode, args.started_s)
+        write(directory, pipeline, recorder, clock, settings)
+    for warning in [*warnings, *reader.warnings]:
+        _note(f"warning: {warning}")
+    return report(pipeline, recorder, results.path)
+
+
+def process(
+    reader: BagReader, calibration: Calibration, settings: Settings, mode: Mode, started_s: float
+) -> tuple[Pipeline, Recorder, Clock]:
+    """Push everything the reader has through fresh stages.
+
+    Args:
+        reader: of the part of the bag that is asked for.
+        calibration: validated for ``mode``.
+        settings: of all stages.
+        mode: which sensors take part.
+        started_s: ``time.perf_counter()`` when the command started.
+    """
+    pipeline = Pipeline(Stages.create(calibration, settings, mode), mode)
+    recorder = Recorder(calibration)
+    begin_s = time.perf_counter()
+    stamps: list[int] = []
+    for item in _with_progress(reader):
+        stamps[1:] = [item.stamp_ns]
+        recorder.add(pipeline.push(item))
+    recorder.add(pipeline.flush())
+    end_s = time.perf_counter()
+    bag_s = (stamps[-1] - stamps[0]) / NANOSECONDS if stamps else 0.0
+    return pipeline, recorder, Clock(begin_s - started_s, end_s - begin_s, time.process_time(), bag_s)
+
+
+def write(directory: Path, pipeline: Pipeline, recorder: Recorder, clock: Clock, settings: Settings) -> None:
+    """Write trajectories, map, picture, times, parameters and summary."""
+    recorder.write(directory)
+    cloud = pipeline.stages.mapper.map.cloud()
+    write_ply(directory / "map.ply", cloud)
+    write_views(directory / "cloud.png", cloud)
+    pipeline.timer.write(directory / "timing.csv")
+    (directory / "config.yaml").write_text(to_yaml(settings))
+    summary = {
+        "frames_long": pipeline.counters["long_images"],
+        "frames_short": pipeline.counters["short_images"],
+        "keyframes": recorder.keyframes,
+        "points": len(cloud),
+        "states": recorder.states,
+        **clock.summary(),
+        **pipeline.timer.summary(),
+    }
+    (directory / SUMMARY).write_text(json.dumps(summary, indent=1) + "\n")
+
+
+def report(pipeline: Pipeline, recorder: Recorder, path: Path) -> int:
+    """Say what came out; return the exit code."""
+    long_frames = pipeline.counters["long_images"]
+    if not recorder.live:
+        _note(f"tracking never started in {long_frames} long frames: {recorder.reason}")
+        return NEVER_TRACKED
+    figures = pipeline.timer.summary()
+    print(
+        f"{len(recorder.live)} poses of {long_frames} long frames, {len(pipeline.stages.mapper.map)} map points, "
+        f"{figures['ms_per_frame_mean']} ms a frame; results in '{path}'"
+    )
+    return 0
+
+
+def _with_progress(reader: BagReader) -> Iterator[EncodedImage | ImuSample]:
+    """Yield what the reader has, with a bar of bag seconds on a terminal and none elsewhere."""
+    start_ns, end_ns = reader.time_range_ns
+    with tqdm(total=round((end_ns - start_ns) / NANOSECONDS, 1), unit="s", disable=not sys.stderr.isatty(), leave=False) as bar:
+        first_ns: int | None = None
+        for item in reader:
+            first_ns = item.stamp_ns if first_ns is None else first_ns
+            bar.update(max(0.0, (item.stamp_ns - first_ns) / NANOSECONDS - bar.n))
+            yield item
+
+
+def _note(text: str) -> None:
+    print(f"vli run: {text}", file=sys.stderr)
