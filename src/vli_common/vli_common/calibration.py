@@ -33,8 +33,8 @@ _NOISE_KEYS = (
 )
 _KEYS = {
     "cam0": (
-        "camera_model", "intrinsics", "distortion_model", "distortion_coeffs", "resolution", "rate_hz", "T_cam_imu", "timeshift_cam_imu",
-        "provenance", "cam_overlaps", "rostopic", "T_cn_cnm1", "T_cn_cnm",
+        "camera_model", "intrinsics", "distortion_model", "distortion_coeffs", "resolution", "rate_hz", "T_cam_imu",
+        "timeshift_cam_imu", "provenance", "cam_overlaps", "rostopic", "T_cn_cnm1", "T_cn_cnm",
     ),
     "imu0": (
         "update_rate", *_NOISE_KEYS, "provenance", "rostopic", "model", "time_offset", "T_i_b", "accelerometers", "gyroscopes",
@@ -57,7 +57,7 @@ _MAX_SIDE_PX = 16384
 
 @dataclass(frozen=True)
 class ImuCalibration:
-    """Rate (Hz) and noise: densities (m/s²/√Hz, rad/s/√Hz) and random walks (m/s³/√Hz, rad/s²/√Hz)."""
+    """Rate (Hz), noise densities (m/s²/√Hz, rad/s/√Hz) and random walks (m/s³/√Hz, rad/s²/√Hz)."""
 
     rate_hz: float
     accelerometer_noise_density: float
@@ -77,7 +77,7 @@ class LaserCalibration:
 
 @dataclass(frozen=True)
 class Calibration:
-    """A validated calibration; ``imu``, ``laser`` and ``T_cam_imu`` are None where absent, which only modes that do without allow.
+    """A validated calibration; ``imu``, ``laser`` and ``T_cam_imu`` are None where the file has none.
 
     ``document`` is the file as read (all keys, provenance too), for writing back and for the calibration topic.
     """
@@ -190,7 +190,9 @@ class _Section:
             return fallback
         value = _to_float(self.values[key])
         if value is None or not math.isfinite(value) or (positive and value <= 0):
-            self.complain(f"'{self.name}.{key}' is '{self.values[key]}', expected a {'positive' if positive else 'finite'} number")
+            self.complain(
+                f"'{self.name}.{key}' is '{self.values[key]}', expected a {'positive' if positive else 'finite'} number"
+            )
             return fallback
         return value
 
@@ -239,8 +241,8 @@ class _Section:
         if np.abs(singular - 1).max() > _ROTATION_TOLERANCE or np.linalg.det(T[:3, :3]) < 0:
             deviation = float(np.abs(singular - 1).max())
             self.complain(
-                f"'{self.name}.{key}' has no rotation (determinant '{np.linalg.det(T[:3, :3]):.6g}', deviation '{deviation:.3g}'), "
-                f"expected an orthonormal right-handed one; re-run 'vli calibrate imu-camera'"
+                f"'{self.name}.{key}' has no rotation (determinant '{np.linalg.det(T[:3, :3]):.6g}', "
+                f"deviation '{deviation:.3g}'), expected an orthonormal right-handed one; re-run 'vli calibrate imu-camera'"
             )
             return None
         T[:3, :3] = u @ vt
@@ -265,7 +267,9 @@ def _parse_yaml(text: str, source: str) -> dict[str, Any]:
         raise CalibrationError(source, [f"not YAML{where}: {getattr(error, 'problem', None) or type(error).__name__}"]) from error
     if not isinstance(document, dict):
         found = "nothing" if document is None else type(document).__name__
-        raise CalibrationError(source, [f"holds '{found}', expected sections {', '.join(_KEYS)}; make one with '{_CAMERA_COMMAND} {source}'"])
+        raise CalibrationError(
+            source, [f"holds '{found}', expected sections {', '.join(_KEYS)}; make one with '{_CAMERA_COMMAND} {source}'"]
+        )
     return document
 
 
@@ -277,7 +281,9 @@ def _sections(document: dict[str, Any], mode: Mode, problems: list[str]) -> dict
     problems += [_unknown(str(name), _KEYS, "section") for name in document if name not in _KEYS and name not in cameras[1:]]
     needed = ["cam0"] + ["imu0"] * mode.uses_imu + ["laser0"] * mode.uses_laser
     problems += [
-        f"section '{name}' is missing, mode '{mode.value}' needs it; {_SECTION_HINTS[name]}" for name in needed if document.get(name) is None
+        f"section '{name}' is missing, mode '{mode.value}' needs it; {_SECTION_HINTS[name]}"
+        for name in needed
+        if document.get(name) is None
     ]
     sections = {}
     for name, keys in _KEYS.items():
@@ -311,7 +317,8 @@ def _camera(section: _Section, mode: Mode) -> CameraModel | None:
     camera = make_camera(model, tuple(intrinsics.tolist()), tuple(coefficients.tolist()), size)
     if not camera.is_invertible():
         section.complain(
-            f"'{section.name}.distortion_coeffs' is '{coefficients.tolist()}', which folds the image over itself; re-run 'vli calibrate camera'"
+            f"'{section.name}.distortion_coeffs' is '{coefficients.tolist()}', which folds the image over itself; "
+            f"re-run 'vli calibrate camera'"
         )
         return None
     return camera
@@ -329,7 +336,8 @@ def _plausible_pinhole(section: _Section, intrinsics: FloatArray, resolution: Fl
     centre_holds = bool(-0.5 <= cx <= width - 0.5 and -0.5 <= cy <= height - 0.5)
     if sizes_hold and not centre_holds:
         section.complain(
-            f"'{section.name}.intrinsics' has the principal point '{cx}, {cy}', expected inside the image of {int(width)}×{int(height)} px"
+            f"'{section.name}.intrinsics' has the principal point '{cx}, {cy}', expected inside "
+            f"the image of {int(width)}×{int(height)} px"
         )
     return sizes_hold and focal_holds and centre_holds
 
@@ -369,7 +377,9 @@ def _check_view(section: _Section, camera: CameraModel, plane: FloatArray, limit
     if not (depth > 0).any():
         section.complain(f"laser plane '{plane.tolist()}' lies behind the camera, expected in front; {_LASER_HINT}")
     elif not ((depth >= limits[0]) & (depth <= limits[1])).any():
-        section.complain(f"laser plane '{plane.tolist()}' does not meet the view between {limits[0]} and {limits[1]} m; {_LASER_HINT}")
+        section.complain(
+            f"laser plane '{plane.tolist()}' does not meet the view between {limits[0]} and {limits[1]} m; {_LASER_HINT}"
+        )
 
 
 def _unknown(name: str, known: Collection[str], what: str, prefix: str = "") -> str:
@@ -378,7 +388,9 @@ def _unknown(name: str, known: Collection[str], what: str, prefix: str = "") -> 
 
 
 def _is_4x4(rows: Any) -> bool:
-    return isinstance(rows, list | tuple) and len(rows) == 4 and all(isinstance(row, list | tuple) and len(row) == 4 for row in rows)
+    return (
+        isinstance(rows, list | tuple) and len(rows) == 4 and all(isinstance(row, list | tuple) and len(row) == 4 for row in rows)
+    )
 
 
 def _to_float(value: Any) -> float | None:

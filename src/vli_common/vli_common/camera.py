@@ -70,9 +70,9 @@ class CameraModel(ABC):
             residual = np.abs(self.to_pixels(rays) - pixels).max()
             # Newton may land beyond a fold, where the round trip closes too; hence the walk from the centre.
             walk = (np.linspace(0.02, 1.0, 50)[:, None, None] * rays).reshape(-1, 2)
-            step = 1e-6
-            along_x = (self.distort(walk + [step, 0]) - self.distort(walk - [step, 0])) / (2 * step)
-            along_y = (self.distort(walk + [0, step]) - self.distort(walk - [0, step])) / (2 * step)
+            along_x, along_y = (
+                (self.distort(walk + step) - self.distort(walk - step)) / (2 * step.sum()) for step in 1e-6 * np.eye(2)
+            )
             determinant = along_x[:, 0] * along_y[:, 1] - along_x[:, 1] * along_y[:, 0]
         return bool(np.isfinite(residual) and residual < 1e-6 and (determinant > 0).all())
 
@@ -164,7 +164,9 @@ MODELS: dict[str, tuple[type[CameraModel], tuple[int, ...]]] = {
 """Distortion model name → class and valid numbers of coefficients."""
 
 
-def make_camera(model: str, intrinsics: tuple[float, ...], coefficients: tuple[float, ...], resolution: tuple[int, int]) -> CameraModel:
+def make_camera(
+    model: str, intrinsics: tuple[float, ...], coefficients: tuple[float, ...], resolution: tuple[int, int]
+) -> CameraModel:
     """Return the camera of a (validated) calibration; a model ``none`` has zero distortion."""
     fx, fy, cx, cy = intrinsics
     if model == "none":

@@ -4,7 +4,7 @@ One description serves the YAML file, ``--set stage.key=value`` and the ROS para
 
     @dataclass(frozen=True)
     class StripeConfig:
-        min_points: int = parameter(20, unit="points", minimum=1, doc="shorter stripes are dropped: fewer false points, fewer far ones")
+        min_points: int = parameter(20, unit="points", minimum=1, doc="shorter stripes are dropped: less noise, fewer far points")
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class ParameterSpec:
     """Description of one parameter; ``name`` is dotted where configs are nested."""
 
     name: str
-    kind: type
+    kind: type[Any]
     default: Any
     unit: str
     minimum: float | None
@@ -47,7 +47,7 @@ class ParameterSpec:
             return f"'{self.name}' is '{value}', expected a finite number"
         if self.choices and value not in self.choices:
             return f"'{self.name}' is '{value}', expected one of {', '.join(self.choices)}"
-        if self.minimum is not None and value < self.minimum or self.maximum is not None and value > self.maximum:
+        if (self.minimum is not None and value < self.minimum) or (self.maximum is not None and value > self.maximum):
             return f"'{self.name}' is '{value}', expected {self._range()}"
         return None
 
@@ -76,7 +76,7 @@ def parameter(
 
 def section(factory: type[T]) -> T:
     """Return a dataclass field that holds a nested config."""
-    return typing.cast(T, dataclasses.field(default_factory=factory))
+    return dataclasses.field(default_factory=factory)
 
 
 def parameters(config_type: type, prefix: str = "") -> Iterator[ParameterSpec]:
@@ -147,7 +147,13 @@ def to_yaml_lines(config: Any, indent: int = 0) -> list[str]:
             lines += [f"{pad}{item.name}:", *to_yaml_lines(value, indent + 2)]
             continue
         spec = specs[item.name]
-        limits = ", ".join(spec.choices) if spec.choices else spec._range() if spec.minimum is not None or spec.maximum is not None else ""
+        limits = (
+            ", ".join(spec.choices)
+            if spec.choices
+            else spec._range()
+            if spec.minimum is not None or spec.maximum is not None
+            else ""
+        )
         notes = "; ".join(part for part in (spec.doc, limits or spec.unit) if part)
         lines += [f"{pad}# {notes}", f"{pad}{item.name}: {_yaml_scalar(value)}"]
     return lines

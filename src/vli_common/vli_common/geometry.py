@@ -105,9 +105,15 @@ def quaternion_from_rotation(rotation: FloatArray) -> FloatArray:
     # The largest of the four squared components is the safe one to divide by (Shepperd's method).
     squares = np.concatenate([1 + 2 * d - trace[..., None], (1 + trace)[..., None]], axis=-1)
     best = np.argmax(squares, axis=-1)
-    x = np.stack([squares[..., 0], m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 2, 1] - m[..., 1, 2]], axis=-1)
-    y = np.stack([m[..., 0, 1] + m[..., 1, 0], squares[..., 1], m[..., 1, 2] + m[..., 2, 1], m[..., 0, 2] - m[..., 2, 0]], axis=-1)
-    z = np.stack([m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1], squares[..., 2], m[..., 1, 0] - m[..., 0, 1]], axis=-1)
+    x = np.stack(
+        [squares[..., 0], m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 2, 1] - m[..., 1, 2]], axis=-1
+    )
+    y = np.stack(
+        [m[..., 0, 1] + m[..., 1, 0], squares[..., 1], m[..., 1, 2] + m[..., 2, 1], m[..., 0, 2] - m[..., 2, 0]], axis=-1
+    )
+    z = np.stack(
+        [m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1], squares[..., 2], m[..., 1, 0] - m[..., 0, 1]], axis=-1
+    )
     w = np.stack(
         [m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1], squares[..., 3]], axis=-1
     )

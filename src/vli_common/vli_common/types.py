@@ -296,7 +296,7 @@ class MapConstraints:
 
 @dataclass(frozen=True, slots=True)
 class PointCloud:
-    """Coloured points in ``map``: points (N, 3), colours (N, 3) uint8 RGB, normals (N, 3) (0 = none), weights (N,) merge counts."""
+    """Coloured points in ``map``: points (N, 3), colours (N, 3) uint8 RGB, normals (N, 3) (0 = none), weights (N,) merges."""
 
     stamp_ns: int
     points: Float32Array

@@ -129,7 +129,9 @@ imu0:
   time_offset: 0.0
   update_rate: 200.0
 """
-KALIBR_IMU_INPUT = "\n".join(line.strip() for line in KALIBR_IMU.splitlines() if ":" in line and "imu0" not in line and "T_i_b" not in line)
+KALIBR_IMU_INPUT = "\n".join(
+    line.strip() for line in KALIBR_IMU.splitlines() if ":" in line and "imu0" not in line and "T_i_b" not in line
+)
 
 
 @pytest.mark.parametrize("imu", [KALIBR_IMU, KALIBR_IMU_INPUT], ids=["written by Kalibr", "read by Kalibr"])
@@ -264,7 +266,9 @@ def test_the_calibration_of_the_recording_is_valid(shared_data: Path) -> None:
 
 
 scalars = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5)
-values = st.recursive(scalars, lambda inner: st.lists(inner, max_size=5) | st.dictionaries(st.text(max_size=4), inner, max_size=3), max_leaves=20)
+values = st.recursive(
+    scalars, lambda inner: st.lists(inner, max_size=5) | st.dictionaries(st.text(max_size=4), inner, max_size=3), max_leaves=20
+)
 
 
 @settings(max_examples=300, deadline=None)

@@ -1,0 +1,139 @@
+"""IMU samples, biases and GTSAM's preintegration ⇄ ROS messages.
+
+A preintegration crosses the topic as GTSAM's own text archive. An archive says how much to allocate and which classes to make, so
+before GTSAM sees it, its skeleton (every token that is no floating-point number) is compared with that of an archive made here,
+its numbers are checked to be finite, and its checksum and time span to be right. Never a pickle.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import re
+import zlib
+
+import gtsam
+import numpy as np
+from geometry_msgs.msg import TwistStamped
+from sensor_msgs.msg import Imu, PointCloud2
+
+from vli_common.errors import MessageError
+from vli_common.messages import from_time, header
+from vli_common.pointcloud import cloud_from_rows, cloud_session, field_count, rows_from_cloud
+from vli_common.pose_messages import from_vector, to_vector
+from vli_common.topics import IMU_FRAME, preintegration_fields
+from vli_common.types import NANOSECONDS, ImuBias, ImuSample, Preintegration
+
+_MAX_ARCHIVE_BYTES = 65536
+_SPAN_TOLERANCE_S = 1e-6
+_NO_DATA = -1.0
+_NUMBER = re.compile(r"-?\d\.\d+e[+-]\d+")
+
+
+def imu_to_message(sample: ImuSample) -> Imu:
+    """Return ``/imu``; the orientation is marked as absent."""
+    message = Imu(header=header(sample.stamp_ns, IMU_FRAME))
+    message.angular_velocity, message.linear_acceleration = to_vector(sample.gyro), to_vector(sample.accel)
+    message.orientation_covariance[0] = _NO_DATA
+    return message
+
+
+def imu_from_message(message: Imu) -> ImuSample:
+    """Return one sample.
+
+    Raises:
+        MessageError: not finite, or marked as holding no angular rate or no acceleration.
+    """
+    if message.angular_velocity_covariance[0] == _NO_DATA or message.linear_acceleration_covariance[0] == _NO_DATA:
+        raise MessageError("IMU message says that it holds no angular rate or no acceleration (covariance '-1')")
+    return ImuSample(
+        from_time(message.header.stamp), from_vector(message.angular_velocity), from_vector(message.linear_acceleration)
+    )
+
+
+def bias_to_message(bias: ImuBias) -> TwistStamped:
+    """Return ``bias``: angular is the gyro's, linear the accelerometer's."""
+    message = TwistStamped(header=header(bias.stamp_ns, IMU_FRAME))
+    message.twist.angular, message.twist.linear = to_vector(bias.gyro), to_vector(bias.accel)
+    return message
+
+
+def bias_from_message(message: TwistStamped, session: int = 0) -> ImuBias:
+    """Return a bias.
+
+    Raises:
+        MessageError: not finite.
+    """
+    gyro, accel = from_vector(message.twist.angular), from_vector(message.twist.linear)
+    return ImuBias(from_time(message.header.stamp), gyro, accel, session)
+
+
+def preintegration_to_message(preintegration: Preintegration) -> PointCloud2:
+    """Return ``preintegration``: one row whose ``data`` is the archive.
+
+    Raises:
+        MessageError: the archive is of a form that no reader would take (sensor pose or Coriolis terms in the parameters).
+    """
+    text: str = preintegration.measurements.serialize()  # type: ignore[attr-defined]
+    _check_archive(text)
+    data = text.encode("ascii")
+    row = np.zeros(1, preintegration_fields(len(data)))
+    row["from_sec"], row["from_nanosec"] = divmod(preintegration.from_ns, NANOSECONDS)
+    row["inflate"], row["crc32"], row["data"] = preintegration.inflate, zlib.crc32(data), np.frombuffer(data, np.uint8)
+    return cloud_from_rows(row, header(preintegration.stamp_ns, IMU_FRAME), preintegration.session)
+
+
+def preintegration_from_message(message: PointCloud2) -> Preintegration:
+    """Return a preintegration that is safe to use.
+
+    Raises:
+        MessageError: malformed, wrong checksum, not finite, or a time span that is not the interval it is sent for.
+    """
+    size = field_count(message, "data")
+    if not 0 < size <= _MAX_ARCHIVE_BYTES:
+        raise MessageError(f"preintegration has '{size}' bytes of data, expected 1 to {_MAX_ARCHIVE_BYTES}")
+    rows = rows_from_cloud(message, preintegration_fields(size))
+    if len(rows) != 1:
+        raise MessageError(f"preintegration has '{len(rows)}' rows, expected 1")
+    row = rows[0]
+    data = row["data"].tobytes()
+    if zlib.crc32(data) != row["crc32"]:
+        raise MessageError(f"preintegration has checksum '{zlib.crc32(data):08x}', expected '{int(row['crc32']):08x}'")
+    if not row["inflate"] >= 1.0:
+        raise MessageError(f"preintegration has inflate '{row['inflate']}', expected at least 1")
+    stamp_ns, from_ns = from_time(message.header.stamp), int(row["from_sec"]) * NANOSECONDS + int(row["from_nanosec"])
+    measurements = _measurements(data)
+    span_s, expected_s = measurements.deltaTij(), (stamp_ns - from_ns) / NANOSECONDS
+    if expected_s <= 0 or not math.isclose(span_s, expected_s, rel_tol=0.0, abs_tol=_SPAN_TOLERANCE_S):
+        raise MessageError(f"preintegration spans '{span_s}' s, its stamps '{expected_s}' s")
+    return Preintegration(stamp_ns, from_ns, measurements, float(row["inflate"]), cloud_session(message, rows))
+
+
+def _measurements(data: bytes) -> gtsam.PreintegratedCombinedMeasurements:
+    try:
+        text = data.decode("ascii")
+        _check_archive(text)
+        measurements = gtsam.PreintegratedCombinedMeasurements(gtsam.PreintegrationCombinedParams.MakeSharedU(0.0))
+        measurements.deserialize(text)
+    except (UnicodeDecodeError, RuntimeError) as error:
+        raise MessageError(f"preintegration is no archive of this GTSAM: {error}") from error
+    return measurements
+
+
+def _check_archive(text: str) -> None:
+    tokens = text.split()
+    if _skeleton(tokens) != _reference_skeleton():
+        raise MessageError("preintegration has an archive of another form (other GTSAM version, or values that are not finite)")
+    if not all(math.isfinite(float(token)) for token in tokens if _NUMBER.fullmatch(token)):
+        raise MessageError("preintegration has values beyond the range of a double")
+
+
+def _skeleton(tokens: list[str]) -> tuple[str, ...]:
+    return tuple("#" if _NUMBER.fullmatch(token) else token for token in tokens)
+
+
+@functools.lru_cache(maxsize=1)
+def _reference_skeleton() -> tuple[str, ...]:
+    params = gtsam.PreintegrationCombinedParams.MakeSharedU(9.81)
+    text: str = gtsam.PreintegratedCombinedMeasurements(params, gtsam.imuBias.ConstantBias()).serialize()
+    return _skeleton(text.split())

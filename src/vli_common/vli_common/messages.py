@@ -1,0 +1,171 @@
+"""Messages ⇄ types: stamps, images, the session and the status.
+
+One pair of functions a topic, here and in ``cloud_messages``, ``pose_messages`` and ``inertial_messages``. ``header.stamp``
+is the frame's own, bit for bit. What comes from a topic is not to be trusted: every reader checks names, sizes, stamps and
+finiteness first and raises :class:`MessageError`; the receiver drops and counts.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from sensor_msgs.msg import CompressedImage
+from sensor_msgs.msg import Image as ImageMessage
+from std_msgs.msg import Header
+
+from vli_common.errors import MessageError
+from vli_common.pointcloud import byte_array
+from vli_common.status import Health, NodeState, StageStatus
+from vli_common.topics import CAMERA_FRAME
+from vli_common.types import NANOSECONDS, EncodedImage, Image
+
+MAX_SECONDS = 2**31 - 1
+_CHANNELS = {"bgr8": 3, "mono8": 1}
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """All state of other sessions is dropped; ``stamp_ns`` is the first one of the new session where known, else 0."""
+
+    number: int
+    reason: str
+    stamp_ns: int = 0
+
+
+def to_time(stamp_ns: int) -> Time:
+    """Return a ROS stamp.
+
+    Raises:
+        MessageError: negative, or beyond what 32 bits of seconds hold.
+    """
+    seconds, nanoseconds = divmod(stamp_ns, NANOSECONDS)
+    if not 0 <= seconds <= MAX_SECONDS:
+        raise MessageError(f"stamp is '{stamp_ns}' ns, expected 0 to {MAX_SECONDS} s")
+    return Time(sec=seconds, nanosec=nanoseconds)
+
+
+def from_time(stamp: Time) -> int:
+    """Return the nanoseconds of a ROS stamp.
+
+    Raises:
+        MessageError: negative, or a second or more of nanoseconds.
+    """
+    if stamp.sec < 0 or stamp.nanosec >= NANOSECONDS:
+        raise MessageError(f"stamp is '{stamp.sec}' s '{stamp.nanosec}' ns, expected seconds from 0 and nanoseconds below 10⁹")
+    return int(stamp.sec) * NANOSECONDS + int(stamp.nanosec)
+
+
+def header(stamp_ns: int, frame: str) -> Header:
+    """Return a header."""
+    return Header(stamp=to_time(stamp_ns), frame_id=frame)
+
+
+def image_to_message(image: Image) -> ImageMessage:
+    """Return ``image_long`` or ``image_short``."""
+    height, width = image.pixels.shape[:2]
+    encoding = "bgr8" if image.is_colour else "mono8"
+    return ImageMessage(
+        header=header(image.stamp_ns, CAMERA_FRAME),
+        height=height,
+        width=width,
+        encoding=encoding,
+        step=width * _CHANNELS[encoding],
+        data=byte_array(image.pixels),
+    )
+
+
+def image_from_message(message: ImageMessage, session: int = 0) -> Image:
+    """Return the image of ``image_long`` or ``image_short``; its pixels are a view of the message's data.
+
+    Raises:
+        MessageError: another encoding, or sizes that do not fit the data.
+    """
+    channels = _CHANNELS.get(message.encoding)
+    if channels is None:
+        raise MessageError(f"image has encoding '{message.encoding}', expected {' or '.join(_CHANNELS)}")
+    width, height, step = message.width, message.height, message.step
+    _check_image_size(message, channels)
+    rows = np.frombuffer(message.data, np.uint8).reshape(height, step)[:, : width * channels]
+    pixels = rows.reshape(height, width, channels) if channels > 1 else rows
+    return Image(from_time(message.header.stamp), pixels, session)
+
+
+def encoded_to_message(image: EncodedImage) -> ImageMessage | CompressedImage:
+    """Return the message of ``/camera/image_raw`` or ``/camera/image_raw/compressed``."""
+    head = header(image.stamp_ns, CAMERA_FRAME)
+    data = byte_array(np.frombuffer(image.data, np.uint8))
+    if image.compressed:
+        return CompressedImage(header=head, format=image.encoding, data=data)
+    return ImageMessage(header=head, height=image.height, width=image.width, encoding=image.encoding, step=image.step, data=data)
+
+
+def encoded_from_message(message: ImageMessage | CompressedImage) -> EncodedImage:
+    """Return what the camera sent, in any encoding, undecoded.
+
+    Raises:
+        MessageError: no data, or sizes that do not fit the data.
+    """
+    stamp_ns = from_time(message.header.stamp)
+    if isinstance(message, CompressedImage):
+        if not message.data:
+            raise MessageError("compressed image has no data")
+        return EncodedImage(stamp_ns, message.data.tobytes(), message.format, compressed=True)
+    _check_image_size(message, 1)
+    return EncodedImage(stamp_ns, message.data.tobytes(), message.encoding, message.width, message.height, message.step)
+
+
+def _check_image_size(message: ImageMessage, bytes_per_pixel: int) -> None:
+    width, height, step, size = message.width, message.height, message.step, len(message.data)
+    if width < 1 or height < 1 or step < width * bytes_per_pixel or size != step * height:
+        raise MessageError(f"image of '{width}' × '{height}' pixels in rows of '{step}' bytes does not fit its '{size}' bytes")
+
+
+def session_to_message(session: Session) -> Header:
+    """Return ``session``: frame_id is "N: reason"."""
+    return header(session.stamp_ns, f"{session.number}: {session.reason}")
+
+
+def session_from_message(message: Header) -> Session:
+    """Return the session of a header "N: reason".
+
+    Raises:
+        MessageError: no number.
+    """
+    number, _, reason = message.frame_id.partition(":")
+    if not (number.isascii() and number.isdigit() and len(number) < 10):
+        raise MessageError(f"session is '{message.frame_id[:80]}', expected 'N: reason'")
+    return Session(int(number), reason.strip(), from_time(message.stamp))
+
+
+def status_to_message(status: StageStatus) -> DiagnosticArray:
+    """Return ``status`` or ``/diagnostics``; the state is the first value."""
+    values = {"state": status.state.value, **status.values}
+    item = DiagnosticStatus(
+        level=bytes([status.health.value]),
+        name=status.node,
+        message=status.hint or status.state.value,
+        hardware_id="vli",
+        values=[KeyValue(key=key, value=value) for key, value in values.items()],
+    )
+    return DiagnosticArray(header=header(status.stamp_ns, ""), status=[item])
+
+
+def status_from_message(message: DiagnosticArray) -> StageStatus:
+    """Return the status of one node.
+
+    Raises:
+        MessageError: not exactly one status, or no known state or level.
+    """
+    if len(message.status) != 1:
+        raise MessageError(f"status has '{len(message.status)}' entries, expected 1")
+    (item,) = message.status
+    values = {pair.key: pair.value for pair in item.values}
+    try:
+        health, state = Health(item.level[0]), NodeState(values.pop("state", ""))
+    except ValueError as error:
+        raise MessageError(f"status of '{item.name}': {error}") from error
+    hint = "" if item.message == state.value else item.message
+    return StageStatus(from_time(message.header.stamp), item.name, health, state, hint, values)
