@@ -34,10 +34,10 @@ class Sensor:
         self._response = (1 + _PIXEL_RESPONSE_SIGMA * rng.standard_normal((height, width))).astype(np.float32)
 
     def expose(self, light: Float32Array, rng: np.random.Generator) -> ByteArray:
-        """Return the RGGB mosaic (H, W) of ``light`` (H, W, 3), blue green red, in grey levels before noise and saturation."""
+        """Return the RGGB mosaic (H, W) of the light on each of its pixels (H, W), in grey levels before noise and saturation."""
         config = self._config
-        mosaic = np.empty(light.shape[:2], np.uint8)
-        noise = rng.standard_normal(light.shape[:2], dtype=np.float32)
+        mosaic = np.empty(light.shape, np.uint8)
+        noise = rng.standard_normal(light.shape, dtype=np.float32)
         _read_out(light, self._response, noise, 255.0 / config.full_well_e, config.read_noise_e, config.black_level, mosaic)
         return mosaic
 
@@ -67,7 +67,6 @@ def _read_out(light, response, noise, gain, read_noise, black, mosaic):
     height, width = mosaic.shape
     for i in range(height):
         for j in range(width):
-            channel = 2 - (i & 1) - (j & 1)
-            charge = min(light[i, j, channel] * response[i, j] / gain, 4.0 * 255.0 / gain)
+            charge = min(light[i, j] * response[i, j] / gain, 4.0 * 255.0 / gain)
             charge += noise[i, j] * np.sqrt(charge + read_noise * read_noise)
             mosaic[i, j] = np.uint8(min(max(np.round(min(charge * gain, 255.0) + black), 0.0), 255.0))
