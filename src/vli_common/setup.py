@@ -17,7 +17,9 @@ setup(
         ("share/vli_common", ["package.xml"]),
     ],
     install_requires=[
+        "gtsam>=4.3",
         "numpy>=1.26",
+        "plyfile>=1.0",
         "PyYAML>=6.0",
     ],
     zip_safe=False,

@@ -46,7 +46,8 @@ class Module:
     def is_plumbing(self) -> bool:
         """True where ROS may be imported: thin nodes, launch files, what vli_common and vli_bringup make nodes of."""
         inside = self.path.relative_to(SOURCES / self.package).parts
-        return "nodes" in inside or "launch" in inside or self.package == "vli_bringup" or self.path.stem in ("messages", "node")
+        plumbing = {"nodes", "launch", "messages", "node"}
+        return self.package == "vli_bringup" or not plumbing.isdisjoint((*inside, self.path.stem))
 
     def __str__(self) -> str:
         return str(self.path.relative_to(SOURCES))

@@ -11,6 +11,7 @@ import pytest
 import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from vli_common.calibration import load_calibration, parse_calibration, to_yaml
 from vli_common.errors import CalibrationError
 from vli_common.types import Mode

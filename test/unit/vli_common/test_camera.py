@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from vli_common.camera import CameraModel, make_camera
 
 INTRINSICS = (362.4, 363.1, 323.7, 236.9)

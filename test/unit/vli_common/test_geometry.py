@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
+
 from vli_common import geometry
 
 vectors = arrays(np.float64, 3, elements=st.floats(-3.0, 3.0))

@@ -19,11 +19,13 @@ from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CompressedImage, PointCloud2, PointField
 from sensor_msgs.msg import Image as ImageMessage
 from std_msgs.msg import Header
-from vli_common import cloud_messages, geometry, inertial_messages, messages, pose_messages
+
+from vli_common import geometry, messages
 from vli_common.errors import MessageError
-from vli_common.pointcloud import pack_rgb, unpack_rgb
+from vli_common.messages.pointcloud import cloud_from_rows, field_count, pack_rgb, unpack_rgb
+from vli_common.messages.poses import from_vector
 from vli_common.status import Health, NodeState, StageStatus
-from vli_common.topics import TOPICS
+from vli_common.topics import TOPICS, TRACKS_FIELDS, preintegration_fields
 from vli_common.types import (
     EncodedImage,
     Image,
@@ -117,12 +119,12 @@ def preintegration_of(samples: int = 60, inflate: float = 1.5) -> Preintegration
 
 
 CLOUDS: dict[str, tuple[Any, Callable[..., PointCloud2], Callable[[PointCloud2], Any]]] = {
-    "laser_points": (scan_of(50), cloud_messages.scan_to_message, cloud_messages.scan_from_message),
-    "tracks": (tracks_of(40), cloud_messages.tracks_to_message, cloud_messages.tracks_from_message),
-    "window": (window_of(30), cloud_messages.window_to_message, cloud_messages.window_from_message),
-    "map_constraints": (constraints_of(20), cloud_messages.constraints_to_message, cloud_messages.constraints_from_message),
-    "cloud": (cloud_of(60, False), cloud_messages.cloud_to_message, cloud_messages.cloud_from_message),
-    "map": (cloud_of(60, True), cloud_messages.cloud_to_message, cloud_messages.cloud_from_message),
+    "laser_points": (scan_of(50), messages.scan_to_message, messages.scan_from_message),
+    "tracks": (tracks_of(40), messages.tracks_to_message, messages.tracks_from_message),
+    "window": (window_of(30), messages.window_to_message, messages.window_from_message),
+    "map_constraints": (constraints_of(20), messages.constraints_to_message, messages.constraints_from_message),
+    "cloud": (cloud_of(60, False), messages.cloud_to_message, messages.cloud_from_message),
+    "map": (cloud_of(60, True), messages.cloud_to_message, messages.cloud_from_message),
 }
 
 
@@ -160,9 +162,9 @@ def test_a_frame_without_tracks_is_still_a_frame() -> None:
     none = Tracks(
         STAMP_NS, False, True, np.empty(0, np.int64), empty, empty, empty, empty[:, 0], empty[:, 0], np.empty(0, np.uint8), 1
     )
-    message = cloud_messages.tracks_to_message(none)
+    message = messages.tracks_to_message(none)
     assert message.width == 1
-    assert cloud_messages.tracks_from_message(message).stationary
+    assert messages.tracks_from_message(message).stationary
 
 
 @settings(deadline=None)
@@ -170,7 +172,7 @@ def test_a_frame_without_tracks_is_still_a_frame() -> None:
 def test_any_scan_comes_back(values: np.ndarray, stamp_ns: int, session: int) -> None:
     wide = values.astype(np.float64)
     scan = LaserScan(stamp_ns, wide[:, :3], wide[:, 3:5], wide[:, 5], wide[:, 6], session)
-    assert_same(cloud_messages.scan_from_message(through_the_wire(cloud_messages.scan_to_message(scan))), scan)
+    assert_same(messages.scan_from_message(through_the_wire(messages.scan_to_message(scan))), scan)
 
 
 @settings(deadline=None)
@@ -179,7 +181,7 @@ def test_any_tracks_come_back_to_the_last_bit(values: np.ndarray, stamp_ns: int,
     ids, flags = np.arange(1, len(values) + 1), np.full(len(values), TrackFlag.NEW, np.uint8)
     columns = (values[:, :2], values[:, 2:4], values[:, 4:6], values[:, 6], values[:, 7])
     tracks = Tracks(stamp_ns, keyframe, stationary, ids, *columns, flags, 7)
-    assert_same(cloud_messages.tracks_from_message(through_the_wire(cloud_messages.tracks_to_message(tracks))), tracks)
+    assert_same(messages.tracks_from_message(through_the_wire(messages.tracks_to_message(tracks))), tracks)
 
 
 @given(arrays(np.uint8, st.tuples(st.integers(0, 40), st.just(3))))
@@ -220,46 +222,44 @@ def test_camera_images_go_through_undecoded(image: EncodedImage) -> None:
 @given(arrays(np.float64, (2, 3), elements=finite), stamps)
 def test_imu_samples_and_biases_come_back(values: np.ndarray, stamp_ns: int) -> None:
     sample, bias = ImuSample(stamp_ns, *values), ImuBias(stamp_ns, *values, session=8)
-    assert_same(inertial_messages.imu_from_message(inertial_messages.imu_to_message(sample)), sample)
-    assert_same(inertial_messages.bias_from_message(inertial_messages.bias_to_message(bias), 8), bias)
+    assert_same(messages.imu_from_message(messages.imu_to_message(sample)), sample)
+    assert_same(messages.bias_from_message(messages.bias_to_message(bias), 8), bias)
 
 
 def test_preintegration_comes_back_with_all_its_digits() -> None:
     sent = preintegration_of()
-    got = inertial_messages.preintegration_from_message(through_the_wire(inertial_messages.preintegration_to_message(sent)))
+    got = messages.preintegration_from_message(through_the_wire(messages.preintegration_to_message(sent)))
     assert (got.stamp_ns, got.from_ns, got.inflate, got.session) == (sent.stamp_ns, sent.from_ns, 1.5, 6)
     assert got.measurements.serialize() == sent.measurements.serialize()  # type: ignore[attr-defined]
 
 
 def test_odometry_is_the_pose_in_odom_with_its_covariance_and_twist_turned() -> None:
     pose = pose_estimate()
-    message = through_the_wire(pose_messages.odometry_to_message(pose))
+    message = through_the_wire(messages.odometry_to_message(pose))
     assert (message.header.frame_id, message.child_frame_id) == ("odom", "imu_link")
-    again = pose_messages.odometry_from_message(message, pose.T_map_odom)
+    again = messages.odometry_from_message(message, pose.T_map_odom)
     assert_same(again, pose, rtol=1e-12)
     expected = pose.T_map_imu[:3, :3].T @ pose.velocity
-    np.testing.assert_allclose(pose_messages.from_vector(message.twist.twist.linear), expected)
+    np.testing.assert_allclose(from_vector(message.twist.twist.linear), expected)
 
 
 def test_transforms_chain_from_map_to_the_imu() -> None:
     pose = pose_estimate()
-    (_, a, b, first), (_, c, d, second) = (
-        pose_messages.transform_from_message(item) for item in pose_messages.pose_transforms(pose)
-    )
+    (_, a, b, first), (_, c, d, second) = (messages.transform_from_message(item) for item in messages.pose_transforms(pose))
     assert (a, b, c, d) == ("map", "odom", "odom", "imu_link")
     np.testing.assert_allclose(first @ second, pose.T_map_imu, atol=1e-14)
-    stamp_ns, T = pose_messages.pose_from_message(through_the_wire(pose_messages.pose_to_message(pose)))
+    stamp_ns, T = messages.pose_from_message(through_the_wire(messages.pose_to_message(pose)))
     assert stamp_ns == STAMP_NS
     np.testing.assert_allclose(T, pose.T_map_imu, atol=1e-15)
 
 
 def test_paths_and_relocalisations_come_back() -> None:
     pose = pose_estimate()
-    ((stamp_ns, T),) = pose_messages.path_from_message(pose_messages.path_to_message([pose_messages.pose_to_message(pose)]))
+    ((stamp_ns, T),) = messages.path_from_message(messages.path_to_message([messages.pose_to_message(pose)]))
     assert stamp_ns == STAMP_NS
     np.testing.assert_allclose(T, pose.T_map_imu, atol=1e-15)
-    message = pose_messages.relocalisation_to_message(STAMP_NS, pose.T_map_odom, pose.covariance)
-    stamp_ns, T, covariance = pose_messages.relocalisation_from_message(through_the_wire(message))
+    message = messages.relocalisation_to_message(STAMP_NS, pose.T_map_odom, pose.covariance)
+    stamp_ns, T, covariance = messages.relocalisation_from_message(through_the_wire(message))
     np.testing.assert_allclose(T, pose.T_map_odom, atol=1e-15)
     np.testing.assert_array_equal(covariance, pose.covariance)
 
@@ -332,7 +332,7 @@ def with_value(name: str, field: str, value: float) -> PointCloud2:
 )
 def test_a_malformed_cloud_is_refused_with_the_reason(message: PointCloud2, complaint: str) -> None:
     with pytest.raises(MessageError) as caught:
-        cloud_messages.scan_from_message(message)
+        messages.scan_from_message(message)
     assert complaint in str(caught.value)
 
 
@@ -360,16 +360,16 @@ def test_an_impossible_value_is_refused_with_the_reason(name: str, field: str, v
 
 def test_tracks_without_the_row_of_the_frame_are_refused() -> None:
     message = broken("tracks")
-    np.frombuffer(message.data, TOPICS[5].fields)["id"][0] = 77
+    np.frombuffer(message.data, TRACKS_FIELDS)["id"][0] = 77
     with pytest.raises(MessageError, match="no row 0"):
-        cloud_messages.tracks_from_message(message)
+        messages.tracks_from_message(message)
 
 
 @pytest.mark.parametrize(
     "changes",
     [
-        {"width": 2**32 - 1}, {"height": 2**32 - 1}, {"width": 0}, {"height": 0}, {"step": 5}, {"step": 2**32 - 1}, {"encoding": "rgb8"},
-        {"data": array.array("B")},
+        {"width": 2**32 - 1}, {"height": 2**32 - 1}, {"width": 0}, {"height": 0}, {"step": 5}, {"step": 2**32 - 1},
+        {"encoding": "rgb8"}, {"data": array.array("B")},
     ],
 )  # fmt: skip
 def test_an_image_whose_sizes_do_not_fit_is_refused(changes: dict[str, Any]) -> None:
@@ -389,17 +389,17 @@ def preintegration_message(
     """Return a preintegration message whose archive is edited and whose checksum is right nevertheless."""
     import zlib
 
-    message = inertial_messages.preintegration_to_message(preintegration_of())
-    layout = inertial_messages.preintegration_fields(inertial_messages.field_count(message, "data"))
+    message = messages.preintegration_to_message(preintegration_of())
+    layout = preintegration_fields(field_count(message, "data"))
     rows = np.frombuffer(message.data, layout)
     data = edit(rows["data"].tobytes().decode()).encode()
-    again = np.zeros(1, inertial_messages.preintegration_fields(len(data)))
+    again = np.zeros(1, preintegration_fields(len(data)))
     for name in ("from_sec", "from_nanosec", "inflate", "crc32"):
         again[name] = row.get(name, rows[name])
     again["data"] = np.frombuffer(data, np.uint8)
     if not keep_checksum and "crc32" not in row:
         again["crc32"] = zlib.crc32(data)
-    return inertial_messages.cloud_from_rows(again, message.header, 6)
+    return cloud_from_rows(again, message.header, 6)
 
 
 def first_number(text: str, replacement: str) -> str:
@@ -426,19 +426,19 @@ def first_number(text: str, replacement: str) -> str:
 )
 def test_a_preintegration_that_is_not_safe_never_reaches_gtsam(message: PointCloud2, complaint: str) -> None:
     with pytest.raises(MessageError) as caught:
-        inertial_messages.preintegration_from_message(message)
+        messages.preintegration_from_message(message)
     assert complaint in str(caught.value)
 
 
 def test_imu_messages_without_the_data_or_with_nan_are_refused() -> None:
-    message = inertial_messages.imu_to_message(ImuSample(STAMP_NS, np.zeros(3), np.zeros(3)))
+    message = messages.imu_to_message(ImuSample(STAMP_NS, np.zeros(3), np.zeros(3)))
     message.angular_velocity_covariance[0] = -1.0
     with pytest.raises(MessageError, match="no angular rate"):
-        inertial_messages.imu_from_message(message)
+        messages.imu_from_message(message)
     message.angular_velocity_covariance[0] = 0.0
     message.linear_acceleration.x = float("nan")
     with pytest.raises(MessageError, match="expected finite"):
-        inertial_messages.imu_from_message(message)
+        messages.imu_from_message(message)
 
 
 @pytest.mark.parametrize("stamp_ns", [-1, 2**31 * 10**9])
@@ -457,7 +457,7 @@ def test_a_session_without_a_number_is_refused(frame: str) -> None:
 
 READERS: list[Callable[[PointCloud2], Any]] = [
     *dict.fromkeys(read for _, _, read in CLOUDS.values()),
-    inertial_messages.preintegration_from_message,
+    messages.preintegration_from_message,
 ]
 
 

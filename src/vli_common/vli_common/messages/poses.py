@@ -18,7 +18,7 @@ from nav_msgs.msg import Odometry, Path
 from vli_common import geometry
 from vli_common.arrays import FloatArray
 from vli_common.errors import MessageError
-from vli_common.messages import from_time, header
+from vli_common.messages.basics import from_time, header
 from vli_common.topics import IMU_FRAME, MAP_FRAME, ODOM_FRAME
 from vli_common.types import PoseEstimate
 

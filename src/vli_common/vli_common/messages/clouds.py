@@ -8,9 +8,9 @@ from sensor_msgs.msg import PointCloud2
 from vli_common import geometry
 from vli_common.arrays import AnyArray, IntArray
 from vli_common.errors import MessageError
-from vli_common.messages import MAX_SECONDS, from_time, header
-from vli_common.pointcloud import cloud_from_rows, cloud_session, pack_rgb, rows_from_cloud, unpack_rgb
-from vli_common.pose_messages import rotations_from_quaternions
+from vli_common.messages.basics import MAX_SECONDS, from_time, header
+from vli_common.messages.pointcloud import cloud_from_rows, cloud_session, pack_rgb, rows_from_cloud, unpack_rgb
+from vli_common.messages.poses import rotations_from_quaternions
 from vli_common.topics import (
     CAMERA_FRAME,
     CLOUD_FIELDS,

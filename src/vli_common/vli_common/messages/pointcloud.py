@@ -21,6 +21,7 @@ from vli_common.errors import MessageError
 _DATATYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 _FORMATS = {code: f"<{name}" for name, code in _DATATYPES.items()}
 _MAX_FIELDS = 64
+_MAX_POINT_BYTES = 2**20
 _SESSION_BYTES = 4
 
 
@@ -134,6 +135,8 @@ def _message_dtype(message: PointCloud2, layout: np.dtype[np.void]) -> np.dtype[
         raise MessageError("cloud is big-endian, expected little-endian")
     if len(message.fields) > _MAX_FIELDS:
         raise MessageError(f"cloud has '{len(message.fields)}' fields, expected at most {_MAX_FIELDS}")
+    if message.point_step > _MAX_POINT_BYTES:
+        raise MessageError(f"cloud has points of '{message.point_step}' bytes, expected at most {_MAX_POINT_BYTES}")
     found = {item.name: item for item in message.fields}
     if len(found) != len(message.fields):
         raise MessageError(f"cloud has a field twice: '{', '.join(item.name for item in message.fields)}'")

@@ -1,9 +1,4 @@
-"""Messages ⇄ types: stamps, images, the session and the status.
-
-One pair of functions a topic, here and in ``cloud_messages``, ``pose_messages`` and ``inertial_messages``. ``header.stamp``
-is the frame's own, bit for bit. What comes from a topic is not to be trusted: every reader checks names, sizes, stamps and
-finiteness first and raises :class:`MessageError`; the receiver drops and counts.
-"""
+"""Messages ⇄ types: stamps, images, the session and the status."""
 
 from __future__ import annotations
 
@@ -17,7 +12,7 @@ from sensor_msgs.msg import Image as ImageMessage
 from std_msgs.msg import Header
 
 from vli_common.errors import MessageError
-from vli_common.pointcloud import byte_array
+from vli_common.messages.pointcloud import byte_array
 from vli_common.status import Health, NodeState, StageStatus
 from vli_common.topics import CAMERA_FRAME
 from vli_common.types import NANOSECONDS, EncodedImage, Image

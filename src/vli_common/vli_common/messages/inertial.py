@@ -18,9 +18,9 @@ from geometry_msgs.msg import TwistStamped
 from sensor_msgs.msg import Imu, PointCloud2
 
 from vli_common.errors import MessageError
-from vli_common.messages import from_time, header
-from vli_common.pointcloud import cloud_from_rows, cloud_session, field_count, rows_from_cloud
-from vli_common.pose_messages import from_vector, to_vector
+from vli_common.messages.basics import from_time, header
+from vli_common.messages.pointcloud import cloud_from_rows, cloud_session, field_count, rows_from_cloud
+from vli_common.messages.poses import from_vector, to_vector
 from vli_common.topics import IMU_FRAME, preintegration_fields
 from vli_common.types import NANOSECONDS, ImuBias, ImuSample, Preintegration
 
