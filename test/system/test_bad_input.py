@@ -1,0 +1,177 @@
+"""Bad input to ``vli run``: one line that says what to do, exit code 2, and nothing left behind."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from tiny_bag import TinyBag, write_calibration
+
+from vli_bringup.cli import main
+
+
+@pytest.fixture(scope="session")
+def good_bag(tmp_path_factory):
+    return TinyBag().write(tmp_path_factory.mktemp("bags") / "good")
+
+
+@pytest.fixture
+def calibration(tmp_path):
+    return write_calibration(tmp_path / "calibration.yaml")
+
+
+@pytest.fixture
+def refused(tmp_path, capsys):
+    """Return a function that runs the command, expects a refusal and returns its line."""
+
+    def run(bag, calibration, *options):
+        before = set(tmp_path.iterdir())
+        assert main(["run", str(bag), "--calib", str(calibration), "--out", str(tmp_path / "out"), *options]) == 2
+        captured = capsys.readouterr()
+        assert captured.out == ""
+        assert captured.err.count("\n") == 1
+        assert set(tmp_path.iterdir()) == before
+        return captured.err
+
+    return run
+
+
+def test_no_bag(refused, calibration, tmp_path):
+    assert f"bag '{tmp_path / 'none'}' does not exist; expected a rosbag2 directory" in refused(tmp_path / "none", calibration)
+
+
+def test_a_directory_without_a_bag(refused, calibration, tmp_path):
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos" / "cat.jpg").touch()
+    assert "holds no .mcap or .db3 file (it holds cat.jpg)" in refused(tmp_path / "photos", calibration)
+
+
+def test_an_empty_file(refused, calibration, tmp_path):
+    (tmp_path / "empty.mcap").touch()
+    assert "empty.mcap" in refused(tmp_path / "empty.mcap", calibration)
+
+
+def test_a_bag_without_the_topics_lists_what_is_there(refused, calibration, tmp_path):
+    bag = TinyBag(image_topics=(), imu_topics=(), others={"/chatter": "hello"}).write(tmp_path / "bag")
+    line = refused(bag, calibration)
+    assert "no image topic '/camera/image_raw'" in line
+    assert "/chatter (std_msgs/msg/String)" in line
+    assert "--topic image=/name" in line
+
+
+def test_a_bag_without_an_imu_names_the_option(refused, calibration, tmp_path):
+    bag = TinyBag(imu_topics=()).write(tmp_path / "bag")
+    assert "has no imu topic '/imu'" in refused(bag, calibration)
+
+
+def test_two_cameras_say_which_to_pick(refused, calibration, tmp_path):
+    bag = TinyBag(image_topics=("/left/image_raw", "/right/image_raw")).write(tmp_path / "bag")
+    line = refused(bag, calibration)
+    assert "has 2 image topics (/left/image_raw, /right/image_raw)" in line
+    assert "--topic image=/left/image_raw" in line
+
+
+def test_stamps_all_zero(refused, calibration, tmp_path):
+    bag = TinyBag(image_stamp=lambda stamp: 0).write(tmp_path / "bag")
+    assert "stamped '0'; expected the time of mid-exposure in header.stamp" in refused(bag, calibration)
+
+
+def test_images_of_another_size(refused, calibration, tmp_path):
+    bag = TinyBag(size=(320, 240)).write(tmp_path / "bag")
+    line = refused(bag, calibration)
+    assert "images on '/camera/image_raw/compressed' are '320 x 240', the calibration is for 160 x 120" in line
+
+
+def test_an_imu_on_another_clock(refused, calibration, tmp_path):
+    bag = TinyBag(imu_stamp=lambda stamp: stamp - 1_600_000_000_000_000_000).write(tmp_path / "bag")
+    line = refused(bag, calibration)
+    assert "no IMU sample on '/imu' lies between the images" in line
+    assert "stamp both by one clock, or run without the IMU: --mode vl" in line
+
+
+def test_an_imu_in_g(refused, calibration, tmp_path):
+    bag = TinyBag(accel=(0.0, 0.0, 1.0)).write(tmp_path / "bag")
+    assert "that is g, multiply linear_acceleration by 9.80665" in refused(bag, calibration)
+
+
+def test_a_gyro_in_degrees(refused, calibration, tmp_path):
+    bag = TinyBag(tilt_rate=0.3, gyro_unit=math.degrees(1), seconds=6.0).write(tmp_path / "bag")
+    assert "that is deg/s, convert angular_velocity to rad/s" in refused(bag, calibration)
+
+
+def test_no_calibration(refused, good_bag, tmp_path):
+    line = refused(good_bag, tmp_path / "none.yaml")
+    assert f"calibration '{tmp_path / 'none.yaml'}': no such file" in line
+    assert "vli calibrate camera" in line
+
+
+def set_plane(*plane):
+    return lambda document: document["laser0"].update(plane=list(plane))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (set_plane(0.0, -1.6, 1.2, 0.02), "norm"),
+        (set_plane(0.0, -0.8, 0.6, math.nan), "nan"),
+        (set_plane(0.0, 0.0, 1.0, 0.02), "behind"),
+        (lambda document: document.pop("laser0"), "laser0"),
+        (lambda document: document["cam0"].update(intrinsics=[120.0, 120.0, 79.5]), "intrinsics"),
+        (lambda document: document["cam0"].update(fx=120.0), "fx"),
+    ],
+    ids=["non-unit normal", "NaN", "plane behind the camera", "no laser", "three intrinsics", "unknown key"],
+)
+def test_an_invalid_calibration(refused, good_bag, tmp_path, change, said):
+    line = refused(good_bag, write_calibration(tmp_path / "calibration.yaml", change))
+    assert said in line
+    assert str(tmp_path / "calibration.yaml") in line
+
+
+def test_every_problem_of_a_calibration_is_said_at_once(refused, good_bag, tmp_path):
+    def change(document):
+        document["laser0"]["plane"] = [0.0, -1.6, 1.2, 0.02]
+        document["imu0"]["update_rate"] = -1.0
+
+    line = refused(good_bag, write_calibration(tmp_path / "calibration.yaml", change))
+    assert "norm" in line
+    assert "update_rate" in line
+
+
+def test_a_calibration_that_is_not_yaml(refused, good_bag, tmp_path):
+    (tmp_path / "calibration.yaml").write_text("cam0: [")
+    assert "not YAML" in refused(good_bag, tmp_path / "calibration.yaml")
+
+
+def test_unknown_and_impossible_parameters_are_said_at_once(refused, good_bag, calibration):
+    line = refused(good_bag, calibration, "--set", "backend.window_keyframe=9", "--set", "demux.min_ratio=-1")
+    assert "unknown parameter 'backend.window_keyframe', did you mean 'backend.window_keyframes'?" in line
+    assert "'demux.min_ratio' is '-1'" in line
+
+
+def test_a_topic_that_is_not_there(refused, good_bag, calibration):
+    assert "no image topic '/front/image'" in refused(good_bag, calibration, "--topic", "image=/front/image")
+
+
+def test_an_output_that_holds_something(good_bag, calibration, tmp_path, capsys):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "thesis.tex").touch()
+    assert main(["run", str(good_bag), "--calib", str(calibration), "--out", str(tmp_path / "out")]) == 2
+    assert "is not empty; choose another with --out DIR" in capsys.readouterr().err
+    assert [item.name for item in (tmp_path / "out").iterdir()] == ["thesis.tex"]
+
+
+def test_a_scan_that_never_starts_says_why_and_exits_with_1(good_bag, calibration, tmp_path, capsys):
+    code = main(["run", str(good_bag), "--calib", str(calibration), "--out", str(tmp_path / "out"), "--mode", "vi"])
+    assert code == 1
+    assert "tracking never started in 60 long frames: " in capsys.readouterr().err
+    assert (tmp_path / "out" / "trajectory.tum").read_text() == ""
+
+
+def test_half_a_bag_is_run_with_a_warning_of_what_was_lost(good_bag, calibration, tmp_path, capsys):
+    whole = next(good_bag.glob("*.mcap")).read_bytes()
+    half = tmp_path / "half.mcap"
+    half.write_bytes(whole[: len(whole) // 2])
+    assert main(["run", str(half), "--calib", str(calibration), "--out", str(tmp_path / "out")]) in (0, 1)
+    lines = capsys.readouterr().err.splitlines()
+    assert sum("warning" in line and "half.mcap" in line for line in lines) == 1
+    assert (tmp_path / "out" / "summary.json").exists()
