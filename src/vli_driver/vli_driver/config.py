@@ -67,11 +67,17 @@ class StripeConfig:
     min_colour_ratio: float = parameter(
         1.3, minimum=0.0, maximum=10.0, doc="light in the laser's channel over that in the others, in colour images; 0 for a white line"
     )
+    max_lean_px: float = parameter(
+        0.12, unit="px", minimum=0.02, maximum=10.0, doc="asymmetry beyond which an edge is taken to cut the line; lower: fewer wrong points at edges"
+    )
     ambiguity: float = parameter(
         0.6, minimum=0.1, maximum=1.0, doc="a second peak of this share of the first makes a column ambiguous unless its neighbours decide"
     )
     max_jump_px: float = parameter(3.0, unit="px", minimum=0.5, maximum=50.0, doc="neighbouring columns that jump further belong to different segments")
     min_segment_points: int = parameter(15, unit="points", minimum=1, maximum=1000, doc="shorter segments are dropped: fewer false points")
+    trim_points: int = parameter(
+        2, unit="points", minimum=0, maximum=20, doc="dropped at either end of a segment, where an edge cuts the line; more: fewer wrong points"
+    )
     min_points: int = parameter(20, unit="points", minimum=1, maximum=1000, doc="a frame with fewer points counts as having no stripe")
     range_margin: float = parameter(
         0.1, minimum=0.0, maximum=1.0, doc="share by which the searched band exceeds laser0.range_m on either side"

@@ -20,6 +20,7 @@ _FWHM = 2.3548
 _SHOT_GAIN = 0.1
 """Variance per grey level of signal: some ten electrons to a grey level, as small 8-bit sensors have."""
 _UNEVEN = 0.15
+_LEAN_REACH = 4
 _MAX_MISSING = 2
 """Missing points that do not end a segment."""
 
@@ -115,10 +116,11 @@ def find_peaks(profiles, channel, first, last, weights, threshold):  # type: ign
         threshold: least height above the profile's background.
 
     Returns:
-        (N, 2, 3) float64: low and high end of the peak at half height, and the height; height zero where there is none.
+        (N, 2, 4) float64: low and high end of the peak at half height, the height, the middle of the ends at a quarter of it; height
+        zero where there is none.
     """
     count, samples = profiles.shape[0], profiles.shape[1]
-    found = np.zeros((count, CANDIDATES, 3))
+    found = np.zeros((count, CANDIDATES, 4))
     line, smooth = np.empty(samples, np.float32), np.empty(samples, np.float32)
     few = np.empty(samples // _BACKGROUND_STEP + 1, np.float32)
     for i in range(count):
@@ -144,7 +146,8 @@ def find_peaks(profiles, channel, first, last, weights, threshold):  # type: ign
             if k and (smooth[max(peak - 1, 0)] > best or smooth[min(peak + 1, samples - 1)] > best):
                 break
             low, high = _extent(smooth, peak, background + 0.5 * (best - background))
-            found[i, k, 0], found[i, k, 1], found[i, k, 2] = low, high, best - background
+            foot = _extent(smooth, peak, background + 0.25 * (best - background))
+            found[i, k, 0], found[i, k, 1], found[i, k, 2], found[i, k, 3] = low, high, best - background, 0.5 * (foot[0] + foot[1])
     return found
 
 
@@ -212,7 +215,7 @@ def locate(profiles, channel, peaks, smoothing, noise, threshold, window_sigmas,
     Args:
         profiles: (N, M, C) uint8.
         channel: where the laser is seen.
-        peaks: (N, 3), one for each profile as :func:`find_peaks` gives them.
+        peaks: (N, 4), one for each profile as :func:`find_peaks` gives them.
         smoothing: sigma of the smoothing, pixels.
         noise: grey levels, of one sample.
         threshold: least height above either side.
@@ -220,12 +223,12 @@ def locate(profiles, channel, peaks, smoothing, noise, threshold, window_sigmas,
         max_width: pixels, wider peaks are no laser line.
 
     Returns:
-        (N, 6) float64: centre, peak I, Σ I, Σ k² var(I_k) of sensor noise, Σ k² I_k² for speckle (k from the centre), Σ I of the other
-        channels' mean; NaN where there is no line.
+        (N, 7) float64: centre, peak I, Σ I, Σ k² var(I_k) of sensor noise, Σ k² I_k² for speckle (k from the centre), Σ I of the other
+        channels' mean, lean (centre less the middle at a quarter of the height); NaN where there is no line.
     """
-    out = np.full((len(peaks), 6), np.nan)
+    out = np.full((len(peaks), 7), np.nan)
     for i in range(len(peaks)):
-        low, high, height = peaks[i]
+        low, high, height, foot = peaks[i]
         width = np.sqrt(max((high - low) ** 2 - (_FWHM * smoothing) ** 2, 1.0))
         if not height > 0 or width > max_width:
             continue
@@ -251,6 +254,7 @@ def locate(profiles, channel, peaks, smoothing, noise, threshold, window_sigmas,
             continue
         out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4] = centre, top, total, sensor, speckle
         out[i, 5] = _other_channels(profiles, i, channel, centre, half, reach)
+        out[i, 6] = centre - foot
     return out
 
 
@@ -259,7 +263,7 @@ def choose_chain(found, ambiguity, max_jump):  # type: ignore[no-untyped-def]
     """Choose one peak per profile so that the line jumps least, the brighter one where that does not decide (Viterbi).
 
     Returns:
-        (N, 3) peaks chosen, and (N,) bool: a second peak of more than ``ambiguity`` of the first was there.
+        (N, 4) peaks chosen, and (N,) bool: a second peak of more than ``ambiguity`` of the first was there.
     """
     count = len(found)
     cost, back = np.zeros((count, CANDIDATES)), np.zeros((count, CANDIDATES), np.int64)
@@ -281,7 +285,7 @@ def choose_chain(found, ambiguity, max_jump):  # type: ignore[no-untyped-def]
                     best, source = before + jump, m
             dimmer = np.log(found[i, 0, 2] / found[i, k, 2]) if k else 0.0
             cost[i, k], back[i, k] = best + dimmer, source
-    chosen = np.zeros((count, 3))
+    chosen = np.zeros((count, found.shape[2]))
     state = 0
     if count:
         state = int(np.argmin(cost[count - 1]))
@@ -292,27 +296,73 @@ def choose_chain(found, ambiguity, max_jump):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
+def _segment_end(located, keep, start, max_jump):  # type: ignore[no-untyped-def]
+    """Return the last profile of the segment that starts at ``start``."""
+    last = start
+    for j in range(start + 1, len(located)):
+        if j - last > _MAX_MISSING + 1:
+            break
+        if keep[j]:
+            if abs(located[j, 0] - located[last, 0]) >= max_jump * (j - last):
+                break
+            last = j
+    return last
+
+
+@njit(cache=True)
 def keep_segments(located, ambiguous, max_jump, min_points, min_colour_ratio):  # type: ignore[no-untyped-def]
     """Return (N,) bool: the profiles whose point lies on a segment that is long, unambiguous and coloured enough."""
-    count = len(located)
-    keep = np.zeros(count, np.bool_)
+    keep = ~np.isnan(located[:, 0])
     i = 0
-    while i < count:
-        if np.isnan(located[i, 0]):
+    while i < len(located):
+        if not keep[i]:
             i += 1
             continue
-        last, end, number, doubtful, own, other = i, i + 1, 0, 0, 0.0, 0.0
-        for j in range(i, count):
-            if np.isnan(located[j, 0]):
-                continue
-            if j - last > _MAX_MISSING + 1 or abs(located[j, 0] - located[last, 0]) >= max_jump * max(j - last, 1):
-                break
-            last, end, number = j, j + 1, number + 1
-            doubtful += ambiguous[j]
-            own += located[j, 2]
-            other += located[j, 5]
-        if number >= min_points and 2 * doubtful <= number and own >= min_colour_ratio * other:
-            for j in range(i, end):
-                keep[j] = not np.isnan(located[j, 0])
-        i = end
+        last = _segment_end(located, keep, i, max_jump)
+        number, doubtful, own, other = 0, 0, 0.0, 0.0
+        for j in range(i, last + 1):
+            if keep[j]:
+                number += 1
+                doubtful += ambiguous[j]
+                own += located[j, 2]
+                other += located[j, 5]
+        if number < min_points or 2 * doubtful > number or own < min_colour_ratio * other:
+            keep[i : last + 1] = False
+        i = last + 1
     return keep
+
+
+@njit(cache=True)
+def trim_segments(located, keep, max_jump, trim, min_points):  # type: ignore[no-untyped-def]
+    """Clear the first and last ``trim`` points of every segment, where an edge cuts the line, and segments that became too short."""
+    i = 0
+    while i < len(located):
+        if not keep[i]:
+            i += 1
+            continue
+        last = _segment_end(located, keep, i, max_jump)
+        number = int(np.sum(keep[i : last + 1]))
+        order = 0
+        for j in range(i, last + 1):
+            if keep[j]:
+                keep[j] = number >= min_points and trim <= order < number - trim
+                order += 1
+        i = last + 1
+
+
+@njit(cache=True)
+def steady_lean(located, keep):  # type: ignore[no-untyped-def]
+    """Return (N,) the median lean of each kept point and its neighbours: speckle averages out, a line that an edge cuts leans on."""
+    count = len(located)
+    lean = np.zeros(count)
+    near = np.empty(2 * _LEAN_REACH + 1)
+    for i in range(count):
+        if not keep[i]:
+            continue
+        number = 0
+        for j in range(max(i - _LEAN_REACH, 0), min(i + _LEAN_REACH, count - 1) + 1):
+            if keep[j] and abs(located[j, 0] - located[i, 0]) < 3 * max(abs(j - i), 1):
+                near[number] = located[j, 6]
+                number += 1
+        lean[i] = _median(near, number)
+    return lean
