@@ -35,7 +35,7 @@ CALIBRATION: dict[str, Any] = {
         "gyroscope_noise_density": 2.4e-4,
         "gyroscope_random_walk": 2.0e-5,
     },
-    "laser0": {"plane": [0.0, -0.8, 0.6, 0.02], "range_m": [0.02, 0.15]},
+    "laser0": {"plane": [0.0, 0.8, -0.6, 0.02], "range_m": [0.02, 0.15]},
 }
 
 

@@ -202,7 +202,10 @@ def test_a_clock_jump_finishes_the_old_session_and_starts_all_stages_anew(pipeli
     play(pipeline, start=1000)
     later = [call for call in log[before:] if call[1] in ("flush", "window", "reset", "frame")]
     assert [method for _, method, _ in later[:4]] == ["flush", "window", "reset", "reset"]
-    assert pipeline.stages.back_end.reason == "the clock of the IMU jumped by -98.9 s" or "jumped by -" in pipeline.stages.back_end.reason
+    assert (
+        pipeline.stages.back_end.reason == "the clock of the IMU jumped by -98.9 s"
+        or "jumped by -" in pipeline.stages.back_end.reason
+    )
     assert pipeline.session == 1
     assert pipeline.stages.back_end.session == 1
     assert pipeline.counters["sessions"] == 1

@@ -32,7 +32,9 @@ def output(stamp_ns, state=TrackingState.TRACKING, reason=""):
 
 def window(stamps, kinds, final):
     poses = np.stack([pose(np.eye(3), np.array([stamp, 0.0, 0.0])) for stamp in stamps])
-    return WindowPoses(stamps[-1], np.array(stamps), np.array(kinds, np.uint8), np.array(final), np.zeros(len(stamps), bool), poses)
+    return WindowPoses(
+        stamps[-1], np.array(stamps), np.array(kinds, np.uint8), np.array(final), np.zeros(len(stamps), bool), poses
+    )
 
 
 def lines(path):

@@ -54,8 +54,11 @@ def test_an_assignment_outranks_the_file(tmp_path):
         ("5", "holds '5', expected sections like '/**/frontend_node:'"),
         ("/**/backnd_node:\n  ros__parameters: {}\n", r"unknown section '/**/backnd_node', did you mean '/**/backend_node'?"),
         ("/**/backend_node:\n  window_keyframes: 6\n", "expected one key 'ros__parameters:'"),
-        ("/**/backend_node:\n  ros__parameters:\n    window: 6\n", "unknown parameter 'backend.window', did you mean 'backend.window_"),
-        ("/**/backend_node:\n  ros__parameters:\n    window_keyframes: 1000\n", "'backend.window_keyframes' is '1000', expected 4 to"),
+        ("/**/backend_node:\n  ros__parameters:\n    window_keyframe: 6\n", "did you mean 'backend.window_keyframes'?"),
+        (
+            "/**/backend_node:\n  ros__parameters:\n    window_keyframes: 1000\n",
+            "'backend.window_keyframes' is '1000', expected 4 to",
+        ),
     ],
 )
 def test_a_broken_file_is_one_error_that_names_the_place(tmp_path, text, said):
