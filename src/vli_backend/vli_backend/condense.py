@@ -162,7 +162,7 @@ def _condense(  # type: ignore[no-untyped-def]
             z = 1.0 / x2
             u, v = x0 * z, x1 * z
             for k in range(3):
-                if k < 2 and not seen or k == 2 and not measured:
+                if (k < 2 and not seen) or (k == 2 and not measured):
                     continue
                 if k < 2:
                     s = 1.0 / sigma[i, j]
@@ -208,8 +208,8 @@ def _condense(  # type: ignore[no-untyped-def]
 class LandmarkArrays:
     """Views on the landmark table that the kernels read; L landmarks, K window slots.
 
-    ``anchor`` (L,) int64; ``anchor_ray`` (L, 2); ``rho`` (L,) 1/m, written by :func:`refine`; ``prior`` (L, 2) mean and sigma of ρ;
-    ``rays`` (L, K, 2); ``sigma`` (L, K) of the rays, 0 where not observed; ``depth`` (L, K) measured 1/z in 1/m; ``depth_sigma``
+    ``anchor`` (L,) int64; ``anchor_ray`` (L, 2); ``rho`` (L,) 1/m, written by :func:`refine`; ``prior`` (L, 2) mean and sigma of
+    ρ; ``rays`` (L, K, 2); ``sigma`` (L, K) of the rays, 0 where not observed; ``depth`` (L, K) measured 1/z in 1/m; ``depth_sigma``
     (L, K), 0 where not measured.
     """
 
@@ -224,7 +224,12 @@ class LandmarkArrays:
 
 
 def refine(
-    landmarks: LandmarkArrays, T_map_camera: FloatArray, use: BoolArray, cauchy: float, limits: tuple[float, float], iterations: int = 5
+    landmarks: LandmarkArrays,
+    T_map_camera: FloatArray,
+    use: BoolArray,
+    cauchy: float,
+    limits: tuple[float, float],
+    iterations: int = 5,
 ) -> FloatArray:
     """Solve every used landmark for its own inverse depth, poses (K, 4, 4) fixed; return the information of ρ (L,), m²."""
     rotations, translations = np.ascontiguousarray(T_map_camera[:, :3, :3]), np.ascontiguousarray(T_map_camera[:, :3, 3])
@@ -232,9 +237,21 @@ def refine(
     m = landmarks
     relative_r, relative_t = _relative_poses(rotations, translations)
     information: FloatArray = _refine(
-        relative_r, relative_t, use, m.anchor, m.anchor_ray, m.rho, m.prior, m.rays[:, :k], m.sigma[:, :k], m.depth[:, :k],
-        m.depth_sigma[:, :k], cauchy, limits, iterations,
-    )  # fmt: skip
+        relative_r,
+        relative_t,
+        use,
+        m.anchor,
+        m.anchor_ray,
+        m.rho,
+        m.prior,
+        m.rays[:, :k],
+        m.sigma[:, :k],
+        m.depth[:, :k],
+        m.depth_sigma[:, :k],
+        cauchy,
+        limits,
+        iterations,
+    )
     return information
 
 
@@ -246,7 +263,19 @@ def condense(landmarks: LandmarkArrays, T_map_camera: FloatArray, use: BoolArray
     m = landmarks
     relative_r, relative_t = _relative_poses(rotations, translations)
     cost = _condense(
-        relative_r, relative_t, use, m.anchor, m.anchor_ray, m.rho, m.prior, m.rays[:, :k], m.sigma[:, :k], m.depth[:, :k],
-        m.depth_sigma[:, :k], cauchy, hessian, gradient,
-    )  # fmt: skip
+        relative_r,
+        relative_t,
+        use,
+        m.anchor,
+        m.anchor_ray,
+        m.rho,
+        m.prior,
+        m.rays[:, :k],
+        m.sigma[:, :k],
+        m.depth[:, :k],
+        m.depth_sigma[:, :k],
+        cauchy,
+        hessian,
+        gradient,
+    )
     return Quadratic(hessian, gradient, float(cost))

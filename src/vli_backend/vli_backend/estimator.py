@@ -67,7 +67,13 @@ class WindowEstimator:
     """
 
     def __init__(
-        self, calibration: Calibration, config: BackEndConfig, first: Tracks, state: KeyframeState, prior: StatePrior, scans: list[LaserScan]
+        self,
+        calibration: Calibration,
+        config: BackEndConfig,
+        first: Tracks,
+        state: KeyframeState,
+        prior: StatePrior,
+        scans: list[LaserScan],
     ) -> None:
         self._config = config
         self._focal_px = calibration.camera.focal_px
@@ -109,9 +115,14 @@ class WindowEstimator:
 
     def current(self, stamp_ns: int, session: int) -> FrameResult:
         """Return the newest state as the result of a frame that has just started the window."""
+        if stamp_ns > self._records[-1].stamp_ns:
+            last = self._records[-1]
+            self._records.append(FrameRecord(stamp_ns, last.T_map_camera, last.stationary))
         covariance = np.diag([1e-8] * 6)
         pose = self._estimate(stamp_ns, self._records[-1].T_map_camera, self._state.velocity, np.zeros(3), covariance, session)
-        return FrameResult(pose, len(self._points.ids), self._window.poses(self._keyframe_poses(), 0, session), self._bias(session))
+        return FrameResult(
+            pose, len(self._points.ids), self._window.poses(self._keyframe_poses(), 0, session), self._bias(session)
+        )
 
     def add_frame(self, frame: FrontEndOutput, session: int) -> FrameResult:
         """Return the pose of one long frame; at a keyframe, solve the window."""
@@ -128,7 +139,9 @@ class WindowEstimator:
             return FrameResult(pose, found.inliers)
         return self._add_keyframe(tracks, imu, found, velocity, session)
 
-    def add_start_keyframe(self, tracks: Tracks, state: KeyframeState, imu: gtsam.PreintegratedCombinedMeasurements | None) -> None:
+    def add_start_keyframe(
+        self, tracks: Tracks, state: KeyframeState, imu: gtsam.PreintegratedCombinedMeasurements | None
+    ) -> None:
         """Append a keyframe whose state a start in motion has found; :meth:`finish_start` solves them together."""
         self._records.append(FrameRecord(tracks.stamp_ns, state.T_map_imu @ self._T_imu_cam, tracks.stationary))
         self._append_keyframe(tracks, state, imu)
@@ -177,9 +190,14 @@ class WindowEstimator:
         rotation, position = (5e-4 + 2e-3 * elapsed, 2e-4 + 1e-2 * elapsed) if with_imu else (0.05, 0.01)
         prior = np.diag(np.repeat([rotation**-2, position**-2], 3))
         return solve_frame_pose(
-            predicted, prior, self._points.positions[rows], self._points.spread[rows], tracks.rays[columns],
-            self._ray_sigma(tracks)[columns], self._config.cauchy,
-        )  # fmt: skip
+            predicted,
+            prior,
+            self._points.positions[rows],
+            self._points.spread[rows],
+            tracks.rays[columns],
+            self._ray_sigma(tracks)[columns],
+            self._config.cauchy,
+        )
 
     def _ray_sigma(self, tracks: Tracks) -> FloatArray:
         result: FloatArray = np.hypot(tracks.sigma_px, self._config.pixel_sigma) / self._focal_px
@@ -195,7 +213,12 @@ class WindowEstimator:
     # -- one keyframe ------------------------------------------------------------------------------------------------------
 
     def _add_keyframe(
-        self, tracks: Tracks, imu: gtsam.PreintegratedCombinedMeasurements | None, found: FramePose, velocity: FloatArray, session: int
+        self,
+        tracks: Tracks,
+        imu: gtsam.PreintegratedCombinedMeasurements | None,
+        found: FramePose,
+        velocity: FloatArray,
+        session: int,
     ) -> FrameResult:
         rate = self._angular_rate()
         T_odom_imu = inverse(self._T_map_odom) @ found.T_map_camera @ self._T_cam_imu
@@ -209,7 +232,9 @@ class WindowEstimator:
         T = self._state.T_map_imu
         self._records = [FrameRecord(tracks.stamp_ns, T @ self._T_imu_cam, tracks.stationary)]
         self._T_map_odom = T @ inverse(T_odom_imu)
-        pose = self._estimate(tracks.stamp_ns, self._records[0].T_map_camera, self._state.velocity, rate, self._covariance(found), session)
+        pose = self._estimate(
+            tracks.stamp_ns, self._records[0].T_map_camera, self._state.velocity, rate, self._covariance(found), session
+        )
         window = self._leave(session)
         return FrameResult(pose, found.inliers, window, self._bias(session))
 
@@ -257,8 +282,13 @@ class WindowEstimator:
             quadratic = condense(self._landmarks.arrays, poses, use, self._config.cauchy)
             if with_map and self.constraints is not None and len(self.constraints):
                 quadratic = quadratic + condense_map(
-                    self.constraints, self._window.stamps, self._window.intervals, poses, self._config.map_sigma_scale, self._config.map_cauchy
-                )  # fmt: skip
+                    self.constraints,
+                    self._window.stamps,
+                    self._window.intervals,
+                    poses,
+                    self._config.map_sigma_scale,
+                    self._config.map_cauchy,
+                )
             return quadratic.in_body_frame(self._T_cam_imu)
 
         return linearise
@@ -275,7 +305,9 @@ class WindowEstimator:
         if full:
             leaving = self._landmarks.split()
             stays = self._landmarks.usable & ~leaving
-            self._smoother.marginalise_oldest(self._condenser(self._landmarks.usable & leaving, False), self._condenser(stays, False))
+            self._smoother.marginalise_oldest(
+                self._condenser(self._landmarks.usable & leaving, False), self._condenser(stays, False)
+            )
             self._landmarks.drop_oldest(leaving)
             self._window.drop_oldest()
             self._points = self._landmark_points(self._keyframe_poses())
@@ -300,13 +332,24 @@ class WindowEstimator:
         rows = np.flatnonzero(table.arrays.sigma[:, slot] > 0)
         config = self._config
         found = laser_depths(
-            table.arrays.rays[rows, slot], points, sigma, self._focal_px, config.depth_radius_px, config.depth_min_points, config.depth_max_rms
+            table.arrays.rays[rows, slot],
+            points,
+            sigma,
+            self._focal_px,
+            config.depth_radius_px,
+            config.depth_min_points,
+            config.depth_max_rms,
         )
         good = np.isfinite(found.inverse_depth)
         # A constant error in pixels is one constant in inverse depth: σ(1/z) = σ_z / z², with σ_z ∝ z².
         floor = config.depth_sigma / _DEPTH_REFERENCE_M**2
         table.set_depths(
-            slot, rows[good], found.inverse_depth[good], np.hypot(found.sigma[good], floor), found.stripe_px[good], config.primary_only
+            slot,
+            rows[good],
+            found.inverse_depth[good],
+            np.hypot(found.sigma[good], floor),
+            found.stripe_px[good],
+            config.primary_only,
         )
 
     # -- views -------------------------------------------------------------------------------------------------------------
@@ -343,7 +386,13 @@ class WindowEstimator:
         return ImuBias(self._window.stamps[-1], self._state.gyro_bias, self._state.accel_bias, session)
 
     def _estimate(
-        self, stamp_ns: int, T_map_camera: FloatArray, velocity: FloatArray, rate: FloatArray, covariance: FloatArray, session: int
+        self,
+        stamp_ns: int,
+        T_map_camera: FloatArray,
+        velocity: FloatArray,
+        rate: FloatArray,
+        covariance: FloatArray,
+        session: int,
     ) -> PoseEstimate:
         return PoseEstimate(stamp_ns, T_map_camera @ self._T_cam_imu, self._T_map_odom, velocity, rate, covariance, session)
 

@@ -16,7 +16,7 @@ from vli_common.arrays import FloatArray
 
 @dataclass(frozen=True)
 class FramePose:
-    """Pose ``T_map_camera`` (4, 4), information (6, 6) of [ω, v] in the camera, inlier count, RMS residual in sigmas, iterations."""
+    """Pose ``T_map_camera`` (4, 4), information (6, 6) of [ω, v] in the camera, inliers, their RMS in sigmas, iterations."""
 
     T_map_camera: FloatArray
     information: FloatArray
@@ -95,9 +95,15 @@ def _solve(rotation, translation, points, spread, rays, sigma, prior, cauchy, it
 
 
 def solve_frame_pose(
-    T_predicted: FloatArray, prior: FloatArray, points: FloatArray, spread: FloatArray, rays: FloatArray, sigma: FloatArray,
-    cauchy: float, iterations: int = 10,
-) -> FramePose:  # fmt: skip
+    T_predicted: FloatArray,
+    prior: FloatArray,
+    points: FloatArray,
+    spread: FloatArray,
+    rays: FloatArray,
+    sigma: FloatArray,
+    cauchy: float,
+    iterations: int = 10,
+) -> FramePose:
     """Return the pose that minimises the robust reprojection error and the distance to the prediction.
 
     Args:
@@ -111,9 +117,16 @@ def solve_frame_pose(
         iterations: at most.
     """
     rotation, translation, h, inliers, squares, done = _solve(
-        np.ascontiguousarray(T_predicted[:3, :3]), np.ascontiguousarray(T_predicted[:3, 3]), points, spread,
-        np.ascontiguousarray(rays), sigma, prior, cauchy, iterations,
-    )  # fmt: skip
+        np.ascontiguousarray(T_predicted[:3, :3]),
+        np.ascontiguousarray(T_predicted[:3, 3]),
+        points,
+        spread,
+        np.ascontiguousarray(rays),
+        sigma,
+        prior,
+        cauchy,
+        iterations,
+    )
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = rotation, translation
     return FramePose(T, h, int(inliers), float(np.sqrt(squares / max(1, 2 * inliers))), int(done))

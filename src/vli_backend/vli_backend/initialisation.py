@@ -1,7 +1,7 @@
 """From nothing to a first window: at rest, or in motion.
 
-The paper starts with two-view geometry and takes the scale from the laser afterwards. Here the stripe gives every feature a metric
-first depth, so the keyframes are chained by PnP and adjusted together with the laser depths (eqs. 2 and 3) at once: two-view
+The paper starts with two-view geometry and takes the scale from the laser afterwards. Here the stripe gives every feature a
+metric first depth, so the keyframes are chained by PnP and adjusted together with the laser depths (eqs. 2 and 3) at once: two-view
 geometry degenerates on the flat scenes that a scanner sees, this does not. Gyro bias, velocities and gravity follow linearly from
 the preintegrated IMU, as in VINS-Mono (Qin et al., 2018, section V-B), with the scale already known.
 """
@@ -24,7 +24,7 @@ GRAVITY = 9.81
 
 @dataclass(frozen=True)
 class ImuAlignment:
-    """World rotation that makes z up, gyro bias (3,), velocities (K, 3) in the rotated world, gravity found before scaling (m/s²)."""
+    """World rotation that makes z up, gyro bias (3,), velocities (K, 3) in the rotated world, length of gravity as found, m/s²."""
 
     R_map_world: FloatArray
     gyro_bias: FloatArray
@@ -33,7 +33,7 @@ class ImuAlignment:
 
 
 def rest_state(measurements: gtsam.PreintegratedCombinedMeasurements) -> KeyframeState:
-    """Return the state of a sensor at rest from its preintegrated IMU: up from the specific force, gyro bias from the rotation."""
+    """Return the state of a sensor at rest from its preintegrated IMU: up is the specific force, the rotation is gyro bias."""
     elapsed = measurements.deltaTij()
     force = measurements.deltaVij() / elapsed
     gyro_bias = so3_log(measurements.deltaRij().matrix()) / elapsed + measurements.biasHatVector()[3:]
@@ -117,7 +117,7 @@ def _corrected_delta(
 def _rotation_bias_jacobian(pim: gtsam.PreintegratedCombinedMeasurements) -> FloatArray:
     """Return d Log(ΔR) / d gyro bias (3, 3), by differences: GTSAM keeps the exact one to itself."""
     step, base = 1e-4, pim.biasHatVector()[3:]
-    columns = []
+    columns: list[FloatArray] = []
     for axis in np.eye(3):
         ahead, behind = (so3_log(_corrected_delta(pim, base + sign * step * axis)[0]) for sign in (1.0, -1.0))
         columns.append((ahead - behind) / (2 * step))
@@ -125,9 +125,12 @@ def _rotation_bias_jacobian(pim: gtsam.PreintegratedCombinedMeasurements) -> Flo
 
 
 def _velocities_and_gravity(
-    T_world_imu: FloatArray, measurements: list[gtsam.PreintegratedCombinedMeasurements], gyro_bias: FloatArray, gravity: FloatArray | None
+    T_world_imu: FloatArray,
+    measurements: list[gtsam.PreintegratedCombinedMeasurements],
+    gyro_bias: FloatArray,
+    gravity: FloatArray | None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Solve p_j = p_i + v_i t + ½ g t² + R_i Δp and v_j = v_i + g t + R_i Δv for all v and g (|g| known when a guess is given)."""
+    """Solve p_j = p_i + v_i t + ½ g t² + R_i Δp, v_j = v_i + g t + R_i Δv for all v and g (|g| is known when a guess is given)."""
     count = len(T_world_imu)
     basis = np.eye(3) if gravity is None else _tangent_basis(gravity)
     fixed = np.zeros(3) if gravity is None else gravity * GRAVITY / np.linalg.norm(gravity)

@@ -33,9 +33,15 @@ class LandmarkTable:
         self.ids: IntArray = np.empty(0, np.int64)
         self.active: BoolArray = np.empty(0, np.bool_)
         self.arrays = LandmarkArrays(
-            anchor=np.empty(0, np.int64), anchor_ray=np.empty((0, 2)), rho=np.empty(0), prior=np.empty((0, 2)),
-            rays=np.empty((0, slots, 2)), sigma=np.empty((0, slots)), depth=np.empty((0, slots)), depth_sigma=np.empty((0, slots)),
-        )  # fmt: skip
+            anchor=np.empty(0, np.int64),
+            anchor_ray=np.empty((0, 2)),
+            rho=np.empty(0),
+            prior=np.empty((0, 2)),
+            rays=np.empty((0, slots, 2)),
+            sigma=np.empty((0, slots)),
+            depth=np.empty((0, slots)),
+            depth_sigma=np.empty((0, slots)),
+        )
         self.stripe: FloatArray = np.empty((0, slots))
         self.information: FloatArray = np.empty(0)
 
@@ -45,7 +51,8 @@ class LandmarkTable:
     @property
     def observations(self) -> IntArray:
         """Number of keyframes that saw each landmark, the anchor included (L,)."""
-        return np.count_nonzero(self.arrays.sigma > 0, axis=1)
+        counts: IntArray = np.count_nonzero(self.arrays.sigma > 0, axis=1)
+        return counts
 
     @property
     def usable(self) -> BoolArray:
@@ -76,10 +83,12 @@ class LandmarkTable:
         self.arrays.sigma[rows[known], slot] = sigma[known]
         self._append(ids[~known], slot, rays[~known], sigma[~known], np.full(np.count_nonzero(~known), rho_guess))
 
-    def set_depths(self, slot: int, rows: IntArray, inverse_depth: FloatArray, sigma: FloatArray, stripe_px: FloatArray, primary_only: bool) -> None:
+    def set_depths(
+        self, slot: int, rows: IntArray, inverse_depth: FloatArray, sigma: FloatArray, stripe_px: FloatArray, primary_only: bool
+    ) -> None:
         """Store laser depths, eq. (2), of landmarks seen in ``slot``.
 
-        With ``primary_only`` a landmark keeps the one depth of the frame in which it was nearest to the stripe (its primary frame).
+        With ``primary_only`` a landmark keeps one depth, that of the frame in which it was nearest to the stripe (its primary frame).
         """
         if primary_only:
             others = self.stripe[rows].copy()
@@ -159,6 +168,11 @@ class LandmarkTable:
 
     def _keep(self, mask: BoolArray) -> None:
         arrays = self.arrays
-        self.ids, self.active, self.stripe, self.information = self.ids[mask], self.active[mask], self.stripe[mask], self.information[mask]
+        self.ids, self.active, self.stripe, self.information = (
+            self.ids[mask],
+            self.active[mask],
+            self.stripe[mask],
+            self.information[mask],
+        )
         for name in ("anchor", "anchor_ray", "rho", "prior", "rays", "sigma", "depth", "depth_sigma"):
             setattr(arrays, name, np.ascontiguousarray(getattr(arrays, name)[mask]))

@@ -79,7 +79,13 @@ def _fit(features, rays, inverse, weight, radius, min_points, max_rms, out):  # 
 
 
 def laser_depths(
-    features: FloatArray, points: FloatArray, sigma: FloatArray, focal_px: float, radius_px: float, min_points: int, max_rms: float
+    features: FloatArray,
+    points: FloatArray,
+    sigma: FloatArray,
+    focal_px: float,
+    radius_px: float,
+    min_points: int,
+    max_rms: float,
 ) -> LaserDepths:
     """Return the laser depth of features (N, 2) rays from stripe points (M, 3) registered in the same camera frame.
 

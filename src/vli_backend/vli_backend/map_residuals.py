@@ -60,9 +60,13 @@ def stripe_system(
 
 
 def condense_map(
-    constraints: MapConstraints, stamps: Sequence[int], intervals: Sequence[Interval], T_map_camera: FloatArray, sigma_scale: float,
+    constraints: MapConstraints,
+    stamps: Sequence[int],
+    intervals: Sequence[Interval],
+    T_map_camera: FloatArray,
+    sigma_scale: float,
     cauchy: float,
-) -> Quadratic:  # fmt: skip
+) -> Quadratic:
     """Return eq. (4) over the camera poses (K, 4, 4) of the window; stripes that are not in the window any more are left out.
 
     Args:
@@ -92,7 +96,12 @@ def condense_map(
         jacobian = stripe_jacobian(T_map_camera[k], T_map_camera[k + 1], alpha, delta)
         pose = interval.poses(T_map_camera[k], T_map_camera[k + 1])[index]
         h, g, c = stripe_system(
-            pose, constraints.points_camera[rows], constraints.points_map[rows], constraints.normals_map[rows], information[rows], cauchy
+            pose,
+            constraints.points_camera[rows],
+            constraints.points_map[rows],
+            constraints.normals_map[rows],
+            information[rows],
+            cauchy,
         )
         span = slice(6 * k, 6 * k + 12)
         hessian[span, span] += jacobian.T @ h @ jacobian

@@ -34,9 +34,12 @@ class Structure:
 
 
 def structure_from_motion(
-    calibration: Calibration, config: BackEndConfig, tracks: list[Tracks], imu: list[gtsam.PreintegratedCombinedMeasurements],
+    calibration: Calibration,
+    config: BackEndConfig,
+    tracks: list[Tracks],
+    imu: list[gtsam.PreintegratedCombinedMeasurements],
     scans: list[LaserScan],
-) -> Structure:  # fmt: skip
+) -> Structure:
     """Return metric keyframe poses from tracks, gyro rotations and stripes.
 
     Args:
@@ -51,7 +54,9 @@ def structure_from_motion(
     rotations = chain_rotations(list(imu), T_cam_imu)
     parallax = _parallax_px(tracks, rotations, focal)
     if parallax < config.start_parallax_px:
-        return Structure(np.empty((0, 4, 4)), f"{parallax:.0f} px of parallax, {config.start_parallax_px:.0f} are needed: move sideways")
+        return Structure(
+            np.empty((0, 4, 4)), f"{parallax:.0f} px of parallax, {config.start_parallax_px:.0f} are needed: move sideways"
+        )
     table = LandmarkTable(max(len(tracks), 2))
     guess = 1.0 / float(np.median(np.concatenate([scan.points[:, 2] for scan in scans])))
     limits = (guess / 6.0, guess * 6.0)
@@ -85,8 +90,14 @@ def _parallax_px(tracks: list[Tracks], rotations: FloatArray, focal_px: float) -
 
 
 def _chain(
-    table: LandmarkTable, config: BackEndConfig, tracks: list[Tracks], rotations: FloatArray, guess: float, focal: float, limits: tuple[float, float]
-) -> FloatArray:  # fmt: skip
+    table: LandmarkTable,
+    config: BackEndConfig,
+    tracks: list[Tracks],
+    rotations: FloatArray,
+    guess: float,
+    focal: float,
+    limits: tuple[float, float],
+) -> FloatArray:
     """Return camera poses (K, 4, 4) by PnP from keyframe to keyframe; the landmarks' depths follow each step."""
     poses = [np.eye(4)]
     for k, track in enumerate(tracks):
@@ -100,7 +111,9 @@ def _chain(
             rays = np.concatenate([arrays.anchor_ray[rows[seen]], np.ones((len(seen), 1))], axis=1)
             directions = np.einsum("nij,nj->ni", anchors[:, :3, :3], rays) / arrays.rho[rows[seen], None]
             prior = np.diag(np.repeat([0.02**-2, 0.05**-2], 3))
-            found = solve_frame_pose(predicted, prior, directions + anchors[:, :3, 3], 0.1 * directions, track.rays[seen], sigma[seen], 2.0)
+            found = solve_frame_pose(
+                predicted, prior, directions + anchors[:, :3, 3], 0.1 * directions, track.rays[seen], sigma[seen], 2.0
+            )
             poses.append(found.T_map_camera)
         table.add_keyframe(track.ids, track.rays, sigma, np.zeros(len(track), np.bool_), guess)
         refine(table.arrays, np.stack(poses), table.usable, config.cauchy, limits)
@@ -109,7 +122,7 @@ def _chain(
 
 def _measure(
     table: LandmarkTable, config: BackEndConfig, tracks: list[Tracks], poses: FloatArray, scans: list[LaserScan], focal: float
-) -> int:  # fmt: skip
+) -> int:
     """Set the laser depths of all keyframes at the present poses; return how many landmarks have one."""
     window = Window()
     for k, track in enumerate(tracks):
@@ -124,9 +137,17 @@ def _measure(
         sigma = np.concatenate([scan.sigma for _, scan in stripes])
         rows = np.flatnonzero(table.arrays.sigma[:, slot] > 0)
         found = laser_depths(
-            table.arrays.rays[rows, slot], points, sigma, focal, config.depth_radius_px, config.depth_min_points, 3 * config.depth_max_rms
+            table.arrays.rays[rows, slot],
+            points,
+            sigma,
+            focal,
+            config.depth_radius_px,
+            config.depth_min_points,
+            3 * config.depth_max_rms,
         )
         good = np.isfinite(found.inverse_depth)
         floor = config.depth_sigma / 0.03**2
-        table.set_depths(slot, rows[good], found.inverse_depth[good], np.hypot(found.sigma[good], floor), found.stripe_px[good], True)
+        table.set_depths(
+            slot, rows[good], found.inverse_depth[good], np.hypot(found.sigma[good], floor), found.stripe_px[good], True
+        )
     return int(np.count_nonzero((table.arrays.depth_sigma > 0).any(axis=1)))

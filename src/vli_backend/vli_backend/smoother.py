@@ -7,9 +7,9 @@ iteration. What leaves with the oldest keyframe is handed over separately at the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, SupportsFloat, SupportsInt
 
 import gtsam
 import numpy as np
@@ -18,7 +18,6 @@ from gtsam.symbol_shorthand import B, V, X
 from vli_backend.condense import Quadratic
 from vli_common.arrays import FloatArray
 from vli_common.errors import VliError
-
 
 _UNMEASURED_WALK = (1e-2, 1e-3)
 """Bias walk across a gap without IMU, accelerometer m/s³/√Hz and gyro rad/s²/√Hz: loose, yet not singular."""
@@ -51,7 +50,7 @@ class KeyframeState:
 
 @dataclass(frozen=True)
 class StatePrior:
-    """Standard deviations of the first keyframe: rotation (3,) about imu_link, position, velocity, gyro bias, accelerometer bias."""
+    """Sigmas of the first keyframe: rotation (3,) about imu_link, position, velocity, gyro bias, accelerometer bias."""
 
     rotation: FloatArray
     position: float
@@ -101,7 +100,7 @@ class GtsamSmoother:
         self._keyframes = keyframes
         self._tolerance = tolerance
         parameters = gtsam.LevenbergMarquardtParams()
-        parameters.setMaxIterations(3)
+        parameters.setMaxIterations(1)
         parameters.setlambdaInitial(1e-9)
         parameters.setLinearSolverType("MULTIFRONTAL_CHOLESKY")
         self._smoother = gtsam.BatchFixedLagSmoother(keyframes - 0.5, parameters)
@@ -228,7 +227,11 @@ class GtsamSmoother:
         raise SmootherError("a factor to be replaced is no longer in the smoother")
 
     def _update(
-        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, stamps: dict[int, float], removed: Sequence[int] = ()
+        self,
+        graph: gtsam.NonlinearFactorGraph,
+        values: gtsam.Values,
+        stamps: Mapping[SupportsInt, SupportsFloat],
+        removed: Sequence[int] = (),
     ) -> None:
         try:
             self._smoother.update(graph, values, stamps, list(removed))

@@ -1,7 +1,7 @@
 """Frames between keyframes: where each stripe was, given the keyframes around it.
 
-Eq. (4) interpolates the pose of a stripe between the adjacent keyframes. Under hand tremor that alone misplaces a stripe by some
-0.1 mm, more than the laser's noise. So the measured shape of the motion is folded in: every long frame has a pose of its own; a
+Eq. (4) interpolates the pose of a stripe between the adjacent keyframes. Under hand tremor that alone misplaces it by some 0.1 mm,
+ more than the laser's noise. So the measured shape of the motion is folded in: every long frame has a pose of its own; a
 frame's deviation δ from the interpolation, δ = interp(T_k, T_k+1, α)⁻¹ T, is taken once when the interval closes and kept while the
 keyframes move.
 """
@@ -77,9 +77,13 @@ def close_interval(frames: list[FrameRecord], scans: list[LaserScan]) -> Interva
     redundant = np.concatenate([rest[1:-1], rest[before] & rest[before + 1]])
     interpolated = interpolate(start.T_map_camera, end.T_map_camera, alpha) if len(alpha) else np.empty((0, 4, 4))
     return Interval(
-        all_stamps[order], kinds[order].astype(np.uint8), redundant[order], alpha, inverse(interpolated) @ all_poses,
+        all_stamps[order],
+        kinds[order].astype(np.uint8),
+        redundant[order],
+        alpha,
+        inverse(interpolated) @ all_poses,
         {scan.stamp_ns: scan for scan in scans},
-    )  # fmt: skip
+    )
 
 
 class Window:
@@ -140,6 +144,11 @@ class Window:
                 count += len(interval.stamps)
             final.append(np.full(count, k < leaving))
         return WindowPoses(
-            self.stamps[-1], np.concatenate(stamps), np.concatenate(kinds), np.concatenate(final), np.concatenate(redundant),
-            np.concatenate(poses), session,
-        )  # fmt: skip
+            self.stamps[-1],
+            np.concatenate(stamps),
+            np.concatenate(kinds),
+            np.concatenate(final),
+            np.concatenate(redundant),
+            np.concatenate(poses),
+            session,
+        )
