@@ -47,6 +47,11 @@ def write_calibration(path: Path, change: Callable[[dict[str, Any]], None] = lam
     return path
 
 
+def unchanged(stamp_ns: int) -> int:
+    """Return the stamp as it is."""
+    return stamp_ns
+
+
 @dataclass
 class TinyBag:
     """Two seconds of noise images, long and short, and of an IMU at rest.
@@ -64,8 +69,8 @@ class TinyBag:
 
     image_topics: tuple[str, ...] = ("/camera/image_raw/compressed",)
     imu_topics: tuple[str, ...] = ("/imu",)
-    image_stamp: Callable[[int], int] = staticmethod(lambda stamp: stamp)
-    imu_stamp: Callable[[int], int] = staticmethod(lambda stamp: stamp)
+    image_stamp: Callable[[int], int] = unchanged
+    imu_stamp: Callable[[int], int] = unchanged
     accel: tuple[float, float, float] = (0.0, 0.0, 9.81)
     tilt_rate: float = 0.0
     gyro_unit: float = 1.0

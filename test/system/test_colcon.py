@@ -1,0 +1,107 @@
+"""The workspace builds with colcon, and every node starts from what was installed and stops cleanly."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.graph
+
+PACKAGES = ["vli_backend", "vli_bringup", "vli_common", "vli_driver", "vli_frontend", "vli_mapping", "vli_simulation"]
+NODES = {
+    "driver_node": "vli_driver",
+    "demux_node": "vli_driver",
+    "frontend_node": "vli_frontend",
+    "backend_node": "vli_backend",
+    "mapping_node": "vli_mapping",
+}
+START_TIMEOUT_S = 120.0
+STOP_TIMEOUT_S = 5.0
+
+
+@dataclass(frozen=True)
+class Workspace:
+    """A colcon workspace that was built: sources, install space and the environment that ``install/setup.bash`` makes."""
+
+    source: Path
+    install: Path
+    environment: dict[str, str]
+
+
+def colcon(directory: Path, *arguments: object) -> str:
+    """Run colcon of this interpreter in a directory of its own; return what it printed."""
+    command = [sys.executable, "-m", "colcon", "--log-base", str(directory / "log"), *map(str, arguments)]
+    result = subprocess.run(command, cwd=directory, capture_output=True, text=True, timeout=300)
+    assert result.returncode == 0, result.stdout + result.stderr
+    return result.stdout
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory, repository):
+    root = tmp_path_factory.mktemp("workspace")
+    ignore = shutil.ignore_patterns("__pycache__", "*.egg-info", "build")
+    # Links are followed: the package data of vli_bringup are links to the top of the repository.
+    shutil.copytree(repository / "src", root / "src", ignore=ignore)
+    colcon(root, "build", "--base-paths", "src")
+    script = f'source "{root}/install/setup.bash" && env -0'
+    raw = subprocess.run(["bash", "-c", script], capture_output=True, check=True, text=True).stdout
+    environment = dict(item.split("=", 1) for item in raw.split("\0") if "=" in item)
+    return Workspace(root / "src", root / "install", environment)
+
+
+def test_colcon_takes_every_package_as_ament_python(workspace, tmp_path):
+    listed = colcon(tmp_path, "list", "--base-paths", workspace.source).split("\n")
+    assert [line.split("\t")[0] for line in listed if line] == PACKAGES
+    assert all(line.endswith("(ros.ament_python)") for line in listed if line)
+
+
+def test_the_packages_are_found_in_the_ament_index_and_imported_from_the_install_space(workspace):
+    for package in PACKAGES:
+        assert (workspace.install / package / "share/ament_index/resource_index/packages" / package).is_file()
+    code = f"import importlib; print(*[importlib.import_module(name).__file__ for name in {PACKAGES}], sep='\\n')"
+    result = subprocess.run([sys.executable, "-c", code], env=workspace.environment, capture_output=True, text=True, check=True)
+    assert [Path(line).is_relative_to(workspace.install) for line in result.stdout.split()] == [True] * len(PACKAGES)
+
+
+def test_configuration_and_launch_files_are_installed(workspace):
+    share = workspace.install / "vli_bringup" / "share" / "vli_bringup"
+    assert (share / "config" / "vli.yaml").is_file()
+    assert list((share / "launch").glob("*.launch.py"))
+
+
+@pytest.mark.timeout(START_TIMEOUT_S + 60)
+@pytest.mark.parametrize("node", NODES)
+def test_a_node_starts_from_the_install_space_and_stops_on_sigint_with_exit_code_0(workspace, node):
+    executable = workspace.install / NODES[node] / "lib" / NODES[node] / node
+    environment = {**workspace.environment, "ROS_DOMAIN_ID": str(100 + os.getpid() % 100), "PYTHONUNBUFFERED": "1"}
+    process = subprocess.Popen([executable], env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    lines: list[str] = []
+    ready = threading.Event()
+
+    def read() -> None:
+        for line in process.stdout:
+            lines.append(line)
+            if "ready" in line:
+                ready.set()
+        ready.set()
+
+    reader = threading.Thread(target=read, daemon=True)
+    reader.start()
+    try:
+        assert ready.wait(START_TIMEOUT_S), "".join(lines)
+        assert process.poll() is None, "".join(lines)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(STOP_TIMEOUT_S) == 0, "".join(lines)
+        reader.join(STOP_TIMEOUT_S)
+        assert "Traceback" not in "".join(lines)
+    finally:
+        process.kill()
+        process.wait()
