@@ -209,8 +209,8 @@ class LandmarkArrays:
     """Views on the landmark table that the kernels read; L landmarks, K window slots.
 
     ``anchor`` (L,) int64; ``anchor_ray`` (L, 2); ``rho`` (L,) 1/m, written by :func:`refine`; ``prior`` (L, 2) mean and sigma of
-    ρ; ``rays`` (L, K, 2); ``sigma`` (L, K) of the rays, 0 where not observed; ``depth`` (L, K) measured 1/z in 1/m; ``depth_sigma``
-    (L, K), 0 where not measured.
+    ρ; ``rays`` (L, K, 2); ``sigma`` (L, K) of the rays, 0 where not observed; ``depth`` (L, K) measured 1/z in 1/m;
+    ``depth_sigma`` (L, K), 0 where not measured.
     """
 
     anchor: AnyArray

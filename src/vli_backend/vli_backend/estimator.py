@@ -12,11 +12,11 @@ from vli_backend.condense import Quadratic, condense, refine
 from vli_backend.config import BackEndConfig
 from vli_backend.frame_pose import FramePose, solve_frame_pose
 from vli_backend.landmarks import LandmarkTable
-from vli_backend.laser_depth import laser_depths
+from vli_backend.laser_depth import measure_slot
 from vli_backend.map_residuals import condense_map
 from vli_backend.smoother import Condenser, GtsamSmoother, KeyframeState, Smoother, SmootherError, StatePrior
-from vli_backend.window import FrameRecord, Interval, Window, close_interval
-from vli_common.arrays import BoolArray, FloatArray, IntArray
+from vli_backend.window import FrameRecord, Window, close_interval
+from vli_common.arrays import BoolArray, FloatArray
 from vli_common.calibration import Calibration
 from vli_common.geometry import inverse, so3_exp, so3_log
 from vli_common.types import (
@@ -31,9 +31,6 @@ from vli_common.types import (
     WindowPoses,
 )
 
-_DEPTH_REFERENCE_M = 0.03
-"""Distance at which ``depth_sigma`` holds; a triangulated depth's error grows with z²."""
-
 
 @dataclass(frozen=True)
 class FrameResult:
@@ -43,15 +40,6 @@ class FrameResult:
     landmarks: int
     window: WindowPoses | None = None
     bias: ImuBias | None = None
-
-
-@dataclass(frozen=True)
-class LandmarkPoints:
-    """Landmarks as points for PnP: ids (N,), positions (N, 3) in map, one sigma along the anchor's ray (N, 3) in map."""
-
-    ids: IntArray
-    positions: FloatArray
-    spread: FloatArray
 
 
 class WindowEstimator:
@@ -97,7 +85,7 @@ class WindowEstimator:
         self._records = [FrameRecord(first.stamp_ns, state.T_map_imu @ self._T_imu_cam, first.stationary)]
         self._previous = self._records[0]
         self._measure_depths()
-        self._points = self._landmark_points(self._keyframe_poses())
+        self._points = self._landmarks.points(self._keyframe_poses())
 
     @property
     def last_pose(self) -> FloatArray:
@@ -273,7 +261,7 @@ class WindowEstimator:
             raise SmootherError("the solution is not finite")
         poses = self._keyframe_poses()
         self._refine(poses, np.ones(len(self._landmarks), np.bool_))
-        self._points = self._landmark_points(poses)
+        self._points = self._landmarks.points(poses)
 
     def _condenser(self, use: BoolArray, with_map: bool) -> Condenser:
         def linearise(T_map_imu: FloatArray) -> Quadratic:
@@ -310,7 +298,7 @@ class WindowEstimator:
             )
             self._landmarks.drop_oldest(leaving)
             self._window.drop_oldest()
-            self._points = self._landmark_points(self._keyframe_poses())
+            self._points = self._landmarks.points(self._keyframe_poses())
         return message
 
     def _measure_depths(self) -> None:
@@ -321,36 +309,7 @@ class WindowEstimator:
             if slot == len(self._window) - 1 and not stripes and self._scans:
                 stripes = [(poses[slot], self._scans[-1])] if len(self._window) == 1 else []
             if stripes:
-                self._measure_slot(slot, poses[slot], stripes)
-
-    def _measure_slot(self, slot: int, T_map_camera: FloatArray, stripes: list[tuple[FloatArray, LaserScan]]) -> None:
-        back = inverse(T_map_camera)
-        registered = [scan.points @ (T := back @ pose)[:3, :3].T + T[:3, 3] for pose, scan in stripes]
-        points = np.concatenate(registered)
-        sigma = np.concatenate([scan.sigma for _, scan in stripes])
-        table = self._landmarks
-        rows = np.flatnonzero(table.arrays.sigma[:, slot] > 0)
-        config = self._config
-        found = laser_depths(
-            table.arrays.rays[rows, slot],
-            points,
-            sigma,
-            self._focal_px,
-            config.depth_radius_px,
-            config.depth_min_points,
-            config.depth_max_rms,
-        )
-        good = np.isfinite(found.inverse_depth)
-        # A constant error in pixels is one constant in inverse depth: σ(1/z) = σ_z / z², with σ_z ∝ z².
-        floor = config.depth_sigma / _DEPTH_REFERENCE_M**2
-        table.set_depths(
-            slot,
-            rows[good],
-            found.inverse_depth[good],
-            np.hypot(found.sigma[good], floor),
-            found.stripe_px[good],
-            config.primary_only,
-        )
+                measure_slot(self._landmarks, slot, poses[slot], stripes, self._focal_px, self._config)
 
     # -- views -------------------------------------------------------------------------------------------------------------
 
@@ -358,19 +317,6 @@ class WindowEstimator:
         """Return ``T_map_camera`` (K, 4, 4) of the window."""
         result: FloatArray = np.stack([state.T_map_imu for state in self._smoother.states()]) @ self._T_imu_cam
         return result
-
-    def _landmark_points(self, poses: FloatArray) -> LandmarkPoints:
-        table = self._landmarks
-        rows = np.flatnonzero(table.active)
-        arrays = table.arrays
-        anchors = poses[arrays.anchor[rows]]
-        rays = np.concatenate([arrays.anchor_ray[rows], np.ones((len(rows), 1))], axis=1)
-        rho = arrays.rho[rows]
-        information = np.maximum(table.information[rows], arrays.prior[rows, 1] ** -2)
-        directions = np.einsum("nij,nj->ni", anchors[:, :3, :3], rays) / rho[:, None]
-        spread = directions * (information**-0.5 / rho)[:, None]
-        ids = table.ids[rows]
-        return LandmarkPoints(ids, directions + anchors[:, :3, 3], spread)
 
     def _covariance(self, found: FramePose) -> FloatArray:
         """Return the (6, 6) covariance in ROS order from that of the frame in the camera."""
@@ -401,6 +347,3 @@ def _inverse_depth_limits(calibration: Calibration) -> tuple[float, float]:
     """Return the inverse depths (1/m) that a landmark may have: the laser's range, generously."""
     near, far = calibration.laser.range_m if calibration.laser is not None else (0.02, 0.15)
     return 0.3 / far, 3.0 / near
-
-
-__all__ = ["FrameResult", "Interval", "WindowEstimator"]

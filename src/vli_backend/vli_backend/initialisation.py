@@ -1,9 +1,9 @@
 """From nothing to a first window: at rest, or in motion.
 
 The paper starts with two-view geometry and takes the scale from the laser afterwards. Here the stripe gives every feature a
-metric first depth, so the keyframes are chained by PnP and adjusted together with the laser depths (eqs. 2 and 3) at once: two-view
-geometry degenerates on the flat scenes that a scanner sees, this does not. Gyro bias, velocities and gravity follow linearly from
-the preintegrated IMU, as in VINS-Mono (Qin et al., 2018, section V-B), with the scale already known.
+metric first depth, so the keyframes are chained by PnP and adjusted together with the laser depths (eqs. 2 and 3) at once:
+two-view geometry degenerates on the flat scenes of a scanner, this does not. Gyro bias, velocities and gravity follow
+linearly from the preintegrated IMU, as in VINS-Mono (Qin et al., 2018, section V-B), with the scale already known.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ GRAVITY = 9.81
 
 @dataclass(frozen=True)
 class ImuAlignment:
-    """World rotation that makes z up, gyro bias (3,), velocities (K, 3) in the rotated world, length of gravity as found, m/s²."""
+    """World rotation that makes z up, gyro bias (3,), velocities (K, 3) in it, length of gravity as found, m/s²."""
 
     R_map_world: FloatArray
     gyro_bias: FloatArray
@@ -69,10 +69,9 @@ def bundle_adjust(condenser: Condenser, T_map_camera: FloatArray, iterations: in
 
 
 def _damped_step(quadratic: Quadratic, damping: float) -> FloatArray:
-    h = quadratic.hessian[6:, 6:].copy()
-    h[np.diag_indices_from(h)] *= 1 + damping
-    h[np.diag_indices_from(h)] += 1e-9
-    result: FloatArray = -np.linalg.solve(h, quadratic.gradient[6:]).reshape(-1, 6)
+    h = quadratic.hessian[6:, 6:]
+    damped = h + np.diag(damping * np.diag(h) + 1e-9)
+    result: FloatArray = -np.linalg.solve(damped, quadratic.gradient[6:]).reshape(-1, 6)
     return result
 
 
@@ -93,7 +92,8 @@ def align_imu(T_world_imu: FloatArray, measurements: list[gtsam.PreintegratedCom
 
 
 def _gyro_bias(T_world_imu: FloatArray, measurements: list[gtsam.PreintegratedCombinedMeasurements]) -> FloatArray:
-    rows, errors = [], []
+    rows: list[FloatArray] = []
+    errors: list[FloatArray] = []
     base = measurements[0].biasHatVector()[3:]
     for k, pim in enumerate(measurements):
         measured = T_world_imu[k, :3, :3].T @ T_world_imu[k + 1, :3, :3]
@@ -130,7 +130,7 @@ def _velocities_and_gravity(
     gyro_bias: FloatArray,
     gravity: FloatArray | None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Solve p_j = p_i + v_i t + ½ g t² + R_i Δp, v_j = v_i + g t + R_i Δv for all v and g (|g| is known when a guess is given)."""
+    """Solve p_j = p_i + v_i t + ½ g t² + R_i Δp, v_j = v_i + g t + R_i Δv for v and g (|g| is known when a guess is given)."""
     count = len(T_world_imu)
     basis = np.eye(3) if gravity is None else _tangent_basis(gravity)
     fixed = np.zeros(3) if gravity is None else gravity * GRAVITY / np.linalg.norm(gravity)

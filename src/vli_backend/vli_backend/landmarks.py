@@ -8,6 +8,8 @@ window is never starved.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from vli_backend.condense import LandmarkArrays
@@ -18,6 +20,15 @@ KEPT_OBSERVATIONS = 4
 
 _PRIOR_SPREAD = 0.5
 """First guess of an inverse depth: one standard deviation, relative."""
+
+
+@dataclass(frozen=True)
+class LandmarkPoints:
+    """Landmarks as points for PnP: ids (N,), positions (N, 3) in map, one sigma along the anchor's ray (N, 3) in map."""
+
+    ids: IntArray
+    positions: FloatArray
+    spread: FloatArray
 
 
 class LandmarkTable:
@@ -88,7 +99,7 @@ class LandmarkTable:
     ) -> None:
         """Store laser depths, eq. (2), of landmarks seen in ``slot``.
 
-        With ``primary_only`` a landmark keeps one depth, that of the frame in which it was nearest to the stripe (its primary frame).
+        With ``primary_only`` a landmark keeps one depth: of its primary frame, in which it was nearest to the stripe.
         """
         if primary_only:
             others = self.stripe[rows].copy()
@@ -141,6 +152,17 @@ class LandmarkTable:
         self.stripe[:, :-1] = self.stripe[:, 1:].copy()
         self.stripe[:, -1] = np.inf
         self.frames -= 1
+
+    def points(self, poses: FloatArray) -> LandmarkPoints:
+        """Return the landmarks whose tracks go on as points in map, keyframe poses ``T_map_camera`` (K, 4, 4) given."""
+        rows = np.flatnonzero(self.active)
+        arrays = self.arrays
+        anchors, rho = poses[arrays.anchor[rows]], arrays.rho[rows]
+        rays = np.concatenate([arrays.anchor_ray[rows], np.ones((len(rows), 1))], axis=1)
+        directions = np.einsum("nij,nj->ni", anchors[:, :3, :3], rays) / rho[:, None]
+        information = np.maximum(self.information[rows], arrays.prior[rows, 1] ** -2)
+        spread = directions * (information**-0.5 / rho)[:, None]
+        return LandmarkPoints(self.ids[rows], directions + anchors[:, :3, 3], spread)
 
     def forget_lost(self, ids: IntArray) -> None:
         """Deactivate landmarks whose track has ended; those seen only once are removed."""

@@ -12,7 +12,14 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
+from vli_backend.config import BackEndConfig
+from vli_backend.landmarks import LandmarkTable
 from vli_common.arrays import FloatArray
+from vli_common.geometry import inverse, transform
+from vli_common.types import LaserScan
+
+_REFERENCE_M = 0.03
+"""Distance at which ``depth_sigma`` holds; a triangulated depth's error grows with z²."""
 
 _SLOPE_PRIOR = 1.5
 """One sigma of the plane's slope d(1/z)/dx, in units of 1/z: the tangent of its tilt."""
@@ -105,3 +112,33 @@ def laser_depths(
         rays = points[:, :2] / z[:, None]
         _fit(features, rays, 1.0 / z, (z * z / sigma) ** 2, radius_px / focal_px, min_points, max_rms, out)
     return LaserDepths(out[:, 0], out[:, 1], out[:, 2] * focal_px)
+
+
+def measure_slot(
+    table: LandmarkTable,
+    slot: int,
+    T_map_camera: FloatArray,
+    stripes: list[tuple[FloatArray, LaserScan]],
+    focal_px: float,
+    config: BackEndConfig,
+) -> None:
+    """Store the laser depths of the landmarks that the keyframe in ``slot`` saw.
+
+    Args:
+        table: of the landmarks; written.
+        slot: of the keyframe.
+        T_map_camera: (4, 4) of the keyframe.
+        stripes: pose (4, 4) and scan of the short frames around it.
+        focal_px: for pixels ⇄ rays.
+        config: parameters.
+    """
+    back = inverse(T_map_camera)
+    points = np.concatenate([transform(back @ pose, scan.points) for pose, scan in stripes])
+    sigma = np.concatenate([scan.sigma for _, scan in stripes])
+    rows = np.flatnonzero(table.arrays.sigma[:, slot] > 0)
+    rays = table.arrays.rays[rows, slot]
+    found = laser_depths(rays, points, sigma, focal_px, config.depth_radius_px, config.depth_min_points, config.depth_max_rms)
+    good = np.isfinite(found.inverse_depth)
+    # A constant error in pixels is one constant in inverse depth: σ(1/z) = σ_z / z², with σ_z ∝ z².
+    sigma_inverse = np.hypot(found.sigma[good], config.depth_sigma / _REFERENCE_M**2)
+    table.set_depths(slot, rows[good], found.inverse_depth[good], sigma_inverse, found.stripe_px[good], config.primary_only)

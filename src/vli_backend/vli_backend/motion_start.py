@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import gtsam
@@ -12,11 +13,11 @@ from vli_backend.config import BackEndConfig
 from vli_backend.frame_pose import solve_frame_pose
 from vli_backend.initialisation import bundle_adjust, chain_rotations
 from vli_backend.landmarks import LandmarkTable
-from vli_backend.laser_depth import laser_depths
+from vli_backend.laser_depth import measure_slot
 from vli_backend.window import FrameRecord, Window, close_interval
 from vli_common.arrays import FloatArray
 from vli_common.calibration import Calibration
-from vli_common.geometry import inverse, pose
+from vli_common.geometry import pose
 from vli_common.types import LaserScan, Tracks
 
 _ROUNDS = 3
@@ -128,26 +129,11 @@ def _measure(
     for k, track in enumerate(tracks):
         pair = [FrameRecord(tracks[i].stamp_ns, poses[i], False) for i in (k - 1, k)] if k else []
         window.append(track.stamp_ns, False, close_interval(pair, scans) if k else None)
+    # Poses are rough yet: so are the depth planes.
+    rough = dataclasses.replace(config, depth_max_rms=3 * config.depth_max_rms, primary_only=True)
     for slot in range(len(tracks)):
         stripes = window.near_scans(slot, poses, round(config.depth_window_s * 1e9))
         if not stripes:
             continue
-        back = inverse(poses[slot])
-        points = np.concatenate([scan.points @ (T := back @ T_scan)[:3, :3].T + T[:3, 3] for T_scan, scan in stripes])
-        sigma = np.concatenate([scan.sigma for _, scan in stripes])
-        rows = np.flatnonzero(table.arrays.sigma[:, slot] > 0)
-        found = laser_depths(
-            table.arrays.rays[rows, slot],
-            points,
-            sigma,
-            focal,
-            config.depth_radius_px,
-            config.depth_min_points,
-            3 * config.depth_max_rms,
-        )
-        good = np.isfinite(found.inverse_depth)
-        floor = config.depth_sigma / 0.03**2
-        table.set_depths(
-            slot, rows[good], found.inverse_depth[good], np.hypot(found.sigma[good], floor), found.stripe_px[good], True
-        )
+        measure_slot(table, slot, poses[slot], stripes, focal, rough)
     return int(np.count_nonzero((table.arrays.depth_sigma > 0).any(axis=1)))

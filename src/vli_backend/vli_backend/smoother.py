@@ -7,9 +7,9 @@ iteration. What leaves with the oldest keyframe is handed over separately at the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol, SupportsFloat, SupportsInt
+from typing import Any, Protocol
 
 import gtsam
 import numpy as np
@@ -110,7 +110,7 @@ class GtsamSmoother:
         self._estimate = gtsam.Values()
         # New keyframes, held back until a container is there: without residuals of their own their poses may be undetermined.
         self._new_factors, self._new_values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        self._new_stamps: dict[int, float] = {}
+        self._new_stamps: Any = {}
 
     def start(self, state: KeyframeState, prior: StatePrior) -> None:
         """See :meth:`Smoother.start`."""
@@ -230,7 +230,7 @@ class GtsamSmoother:
         self,
         graph: gtsam.NonlinearFactorGraph,
         values: gtsam.Values,
-        stamps: Mapping[SupportsInt, SupportsFloat],
+        stamps: Any,
         removed: Sequence[int] = (),
     ) -> None:
         try:

@@ -1,9 +1,9 @@
 """Frames between keyframes: where each stripe was, given the keyframes around it.
 
-Eq. (4) interpolates the pose of a stripe between the adjacent keyframes. Under hand tremor that alone misplaces it by some 0.1 mm,
- more than the laser's noise. So the measured shape of the motion is folded in: every long frame has a pose of its own; a
-frame's deviation δ from the interpolation, δ = interp(T_k, T_k+1, α)⁻¹ T, is taken once when the interval closes and kept while the
-keyframes move.
+Eq. (4) interpolates the pose of a stripe between the adjacent keyframes. Under hand tremor that alone misplaces it by some
+0.1 mm, more than the laser's noise. So the measured shape of the motion is folded in: every long frame has a pose of its own; a
+frame's deviation from the interpolation, δ = interp(T_k, T_k+1, α)⁻¹ T, is taken once when the interval closes, and kept while
+the keyframes move.
 """
 
 from __future__ import annotations
