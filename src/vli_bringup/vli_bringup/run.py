@@ -19,7 +19,7 @@ from vli_bringup.pipeline import Pipeline, Stages
 from vli_bringup.recorder import Recorder
 from vli_bringup.settings import Settings, to_yaml
 from vli_bringup.warm_up import warm_up
-from vli_common.calibration import Calibration, load_calibration
+from vli_common.calibration import load_calibration
 from vli_common.types import NANOSECONDS, EncodedImage, ImuSample, Mode
 from vli_driver.bag import BagReader
 from vli_mapping.render import write_views
@@ -75,36 +75,32 @@ def run(args: argparse.Namespace) -> int:
     results = ResultsDirectory(args.out, args.overwrite)
     with results as directory:
         warm_up()
-        pipeline, recorder, clock = process(reader, calibration, settings, mode, args.started_s)
+        pipeline = Pipeline(Stages.create(calibration, settings, mode), mode)
+        recorder = Recorder(calibration)
+        clock = process(reader, pipeline, recorder, _duration_s(reader, args.start, args.duration), args.started_s)
         write(directory, pipeline, recorder, clock, settings)
     for warning in [*warnings, *reader.warnings]:
         _note(f"warning: {warning}")
     return report(pipeline, recorder, results.path)
 
 
-def process(
-    reader: BagReader, calibration: Calibration, settings: Settings, mode: Mode, started_s: float
-) -> tuple[Pipeline, Recorder, Clock]:
-    """Push everything the reader has through fresh stages.
+def process(reader: BagReader, pipeline: Pipeline, recorder: Recorder, duration_s: float, started_s: float) -> Clock:
+    """Push everything the reader has through the pipeline and record what comes out.
 
     Args:
         reader: of the part of the bag that is asked for.
-        calibration: validated for ``mode``.
-        settings: of all stages.
-        mode: which sensors take part.
+        pipeline: fresh.
+        recorder: fresh.
+        duration_s: seconds of bag to expect, for the progress bar.
         started_s: ``time.perf_counter()`` when the command started.
     """
-    pipeline = Pipeline(Stages.create(calibration, settings, mode), mode)
-    recorder = Recorder(calibration)
     begin_s = time.perf_counter()
-    stamps: list[int] = []
-    for item in _with_progress(reader):
-        stamps[1:] = [item.stamp_ns]
+    bag_s = 0.0
+    for item, bag_s in _with_progress(reader, duration_s):
         recorder.add(pipeline.push(item))
     recorder.add(pipeline.flush())
     end_s = time.perf_counter()
-    bag_s = (stamps[-1] - stamps[0]) / NANOSECONDS if stamps else 0.0
-    return pipeline, recorder, Clock(begin_s - started_s, end_s - begin_s, time.process_time(), bag_s)
+    return Clock(begin_s - started_s, end_s - begin_s, time.process_time(), bag_s)
 
 
 def write(directory: Path, pipeline: Pipeline, recorder: Recorder, clock: Clock, settings: Settings) -> None:
@@ -141,15 +137,22 @@ def report(pipeline: Pipeline, recorder: Recorder, path: Path) -> int:
     return 0
 
 
-def _with_progress(reader: BagReader) -> Iterator[EncodedImage | ImuSample]:
-    """Yield what the reader has, with a bar of bag seconds on a terminal and none elsewhere."""
-    start_ns, end_ns = reader.time_range_ns
-    with tqdm(total=round((end_ns - start_ns) / NANOSECONDS, 1), unit="s", disable=not sys.stderr.isatty(), leave=False) as bar:
+def _with_progress(reader: BagReader, duration_s: float) -> Iterator[tuple[EncodedImage | ImuSample, float]]:
+    """Yield what the reader has with the bag seconds gone; a bar shows them on a terminal, and nothing elsewhere."""
+    with tqdm(total=round(duration_s, 1), unit="s", disable=not sys.stderr.isatty(), leave=False) as bar:
         first_ns: int | None = None
         for item in reader:
             first_ns = item.stamp_ns if first_ns is None else first_ns
-            bar.update(max(0.0, (item.stamp_ns - first_ns) / NANOSECONDS - bar.n))
-            yield item
+            bag_s = (item.stamp_ns - first_ns) / NANOSECONDS
+            bar.update(max(0.0, round(bag_s, 1) - bar.n))
+            yield item, bag_s
+
+
+def _duration_s(reader: BagReader, start_s: float, duration_s: float | None) -> float:
+    """Return how much there is to read, as far as the bag's headers tell."""
+    start_ns, end_ns = reader.time_range_ns
+    left_s = max(0.0, (end_ns - start_ns) / NANOSECONDS - start_s)
+    return left_s if duration_s is None else min(left_s, duration_s)
 
 
 def _note(text: str) -> None:
