@@ -11,7 +11,7 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from vli_common.arrays import ByteArray, Float32Array, FloatArray, IntArray
+from vli_common.arrays import AnyArray, ByteArray, Float32Array, FloatArray, IntArray
 from vli_common.types import Counters
 from vli_driver import stripe_kernels as kernels
 from vli_driver.config import StripeConfig
@@ -65,10 +65,10 @@ class CentreOfMassDetector:
         self.config = config
         self.band = band
         self.counters = Counters()
-        samples = np.arange(int(np.ceil(3 * config.smoothing_px)) + 1)
-        half = np.exp(-0.5 * (samples / config.smoothing_px) ** 2)
-        self._weights: Float32Array = (half / (half[0] + 2 * half[1:].sum())).astype(np.float32)
-        self._noise_gain = float(np.sqrt(self._weights[0] ** 2 + 2 * (self._weights[1:] ** 2).sum()))
+        half = np.exp(-0.5 * (np.arange(int(np.ceil(3 * config.smoothing_px)) + 1) / config.smoothing_px) ** 2)
+        self._weights: Float32Array = (half / (2 * half.sum() - half[0])).astype(np.float32)
+        self._noise_gain = float(np.sqrt(2 * (self._weights**2).sum() - self._weights[0] ** 2))
+        self._smooth: AnyArray = np.empty((0, 0), np.uint16)
         self._start = max(band.start - _PAD, 0)
         self._first: IntArray = np.maximum(band.first - self._start, 0)
         self._last: IntArray = np.maximum(band.last - self._start, 0)
@@ -80,8 +80,8 @@ class CentreOfMassDetector:
         channel = self._channel(profiles)
         noise = kernels.noise_level(profiles, channel)
         threshold = max(config.min_peak, config.min_snr * self._noise_gain * noise)
-        found = kernels.find_peaks(profiles, channel, self._first, self._last, self._weights, threshold)
-        peaks, ambiguous = kernels.choose_chain(found, config.ambiguity, config.max_jump_px)
+        found = kernels.find_peaks(self._smoothed(profiles, channel), self._first, self._last, threshold, config.ambiguity)
+        peaks, ambiguous = kernels.choose_chain(found, config.max_jump_px)
         located = kernels.locate(
             profiles, channel, peaks, config.smoothing_px, noise, threshold, config.window_sigmas, config.max_width_px
         )
@@ -102,6 +102,15 @@ class CentreOfMassDetector:
         else:
             band = np.ascontiguousarray(pixels[:, self._start : stop])
         return band if band.ndim == 3 else band[:, :, None]
+
+    def _smoothed(self, profiles: ByteArray, channel: int) -> AnyArray:
+        """Return one channel of the profiles (N, M), smoothed along each."""
+        lines = profiles[:, :, 0] if profiles.shape[2] == 1 else cv2.extractChannel(profiles, channel)
+        # Kept from frame to frame: fresh memory of this size costs more than the convolution.
+        if self._smooth.shape != lines.shape:
+            self._smooth = np.empty(lines.shape, np.uint16)
+        kernels.smooth(lines, self._weights, self._smooth)
+        return self._smooth
 
     def _channel(self, profiles: ByteArray) -> int:
         if profiles.shape[2] == 1:
