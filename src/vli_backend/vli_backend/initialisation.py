@@ -71,8 +71,7 @@ def bundle_adjust(condenser: Condenser, T_map_camera: FloatArray, iterations: in
 def _damped_step(quadratic: Quadratic, damping: float) -> FloatArray:
     h = quadratic.hessian[6:, 6:]
     damped = h + np.diag(damping * np.diag(h) + 1e-9)
-    result: FloatArray = -np.linalg.solve(damped, quadratic.gradient[6:]).reshape(-1, 6)
-    return result
+    return np.asarray(-np.linalg.solve(damped, quadratic.gradient[6:])).reshape(-1, 6)
 
 
 def _retract(T: FloatArray, step: FloatArray) -> FloatArray:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from vli_common.arrays import BoolArray, ByteArray, FloatArray, IntArray
+from vli_common.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray
 from vli_common.geometry import interpolate, inverse
 from vli_common.types import FrameKind, LaserScan, WindowPoses
 
@@ -128,27 +128,22 @@ class Window:
             leaving: how many keyframes leave the window.
             session: of the message.
         """
-        stamps, kinds, final, redundant, poses = [], [], [], [], []
-        for k, stamp in enumerate(self.stamps):
-            stamps.append(np.array([stamp], np.int64))
-            kinds.append(np.array([FrameKind.KEYFRAME.value], np.uint8))
-            redundant.append(np.array([self.stationary[k]]))
-            poses.append(T_map_camera[k][None])
-            count = 1
-            if k < len(self.intervals):
-                interval = self.intervals[k]
-                stamps.append(interval.stamps)
-                kinds.append(interval.kinds)
-                redundant.append(interval.redundant)
-                poses.append(interval.poses(T_map_camera[k], T_map_camera[k + 1]))
-                count += len(interval.stamps)
-            final.append(np.full(count, k < leaving))
+        starts = np.repeat(np.arange(len(self.intervals)), [len(interval.stamps) for interval in self.intervals])
+        inner = interpolate(T_map_camera[starts], T_map_camera[starts + 1], self._joined("alpha")) @ self._joined("delta")
+        keyframes = np.full(len(self), FrameKind.KEYFRAME.value, np.uint8)
+        stamps = np.concatenate([np.array(self.stamps, np.int64), self._joined("stamps")])
+        order = np.argsort(stamps, kind="stable")
         return WindowPoses(
             self.stamps[-1],
-            np.concatenate(stamps),
-            np.concatenate(kinds),
-            np.concatenate(final),
-            np.concatenate(redundant),
-            np.concatenate(poses),
+            stamps[order],
+            np.concatenate([keyframes, self._joined("kinds")])[order],
+            np.concatenate([np.arange(len(self)) < leaving, starts < leaving])[order],
+            np.concatenate([np.array(self.stationary, np.bool_), self._joined("redundant")])[order],
+            np.concatenate([T_map_camera, inner])[order],
             session,
         )
+
+    def _joined(self, name: str) -> AnyArray:
+        """Return one column of all intervals, end to end; of the right shape also when there are none."""
+        empty = Interval(np.empty(0, np.int64), np.empty(0, np.uint8), np.empty(0, np.bool_), np.empty(0), np.empty((0, 4, 4)))
+        return np.concatenate([getattr(interval, name) for interval in (empty, *self.intervals)])

@@ -6,6 +6,7 @@ rotation first, as in GTSAM.
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 
 from vli_common.arrays import FloatArray
@@ -89,12 +90,45 @@ def interpolate(T0: FloatArray, T1: FloatArray, alpha: FloatArray | float) -> Fl
     Args:
         T0, T1: (4, 4), or stacks (N, 4, 4).
         alpha: scalar, or (N,) for a stack of results.
+
+    The rotation between the two must be less than 180°, as between frames of one camera it always is.
     """
     alpha = np.asarray(alpha, dtype=np.float64)
-    phi = so3_log(np.swapaxes(T0[..., :3, :3], -1, -2) @ T1[..., :3, :3])
-    rotation = T0[..., :3, :3] @ so3_exp(alpha[..., None] * phi)
-    translation = (1 - alpha)[..., None] * T0[..., :3, 3] + alpha[..., None] * T1[..., :3, 3]
-    return pose(rotation, translation)
+    shape = np.broadcast_shapes(T0.shape[:-2], T1.shape[:-2], alpha.shape)
+    stack = [np.broadcast_to(T, (*shape, 4, 4)).reshape(-1, 4, 4) for T in (T0, T1)]
+    result: FloatArray = _interpolate(stack[0], stack[1], np.broadcast_to(alpha, shape).reshape(-1)).reshape(*shape, 4, 4)
+    return result
+
+
+@numba.njit(cache=True)
+def _interpolate(start, end, alpha):  # type: ignore[no-untyped-def]
+    """Interpolate between poses (N, 4, 4); in numba since every frame of the window passes here at every keyframe."""
+    out = np.zeros((len(alpha), 4, 4))
+    r = np.empty((3, 3))
+    for i in range(len(alpha)):
+        for m in range(3):
+            for n in range(3):
+                r[m, n] = 0.0
+                for k in range(3):
+                    r[m, n] += start[i, k, m] * end[i, k, n]
+        # Half-angle form: exact for small angles, where acos of the trace is not.
+        x, y, z = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
+        sine, cosine = 0.5 * np.sqrt(x * x + y * y + z * z), 0.5 * (r[0, 0] + r[1, 1] + r[2, 2] - 1.0)
+        angle = np.arctan2(sine, cosine) * alpha[i]
+        if sine > 1e-12:
+            x, y, z = 0.5 * x / sine, 0.5 * y / sine, 0.5 * z / sine
+        s, c = np.sin(angle), 1.0 - np.cos(angle)
+        e = (
+            (1.0 - c * (y * y + z * z), c * x * y - s * z, c * x * z + s * y),
+            (c * x * y + s * z, 1.0 - c * (x * x + z * z), c * y * z - s * x),
+            (c * x * z - s * y, c * y * z + s * x, 1.0 - c * (x * x + y * y)),
+        )
+        for m in range(3):
+            for n in range(3):
+                out[i, m, n] = start[i, m, 0] * e[0][n] + start[i, m, 1] * e[1][n] + start[i, m, 2] * e[2][n]
+            out[i, m, 3] = (1.0 - alpha[i]) * start[i, m, 3] + alpha[i] * end[i, m, 3]
+        out[i, 3, 3] = 1.0
+    return out
 
 
 def quaternion_from_rotation(rotation: FloatArray) -> FloatArray:
