@@ -1,0 +1,142 @@
+"""Normals from neighbouring points: a plane through those within a radius, by principal components.
+
+The planarity of a neighbourhood is 1 − λ₀/λ₁ of the eigenvalues λ₀ ≤ λ₁ ≤ λ₂ of its covariance: near 1 on a surface, small on an edge,
+in clutter, and along a single stripe, whose points say nothing of the direction across. Where it is low there is no normal, (0, 0, 0).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from vli_common.arrays import Float32Array, FloatArray, IntArray
+from vli_mapping.spatial_hash import SpatialHash, neighbours
+
+MAX_NEIGHBOURS = 192
+MIN_NEIGHBOURS = 6
+
+
+def stripe_normals(
+    points: FloatArray, beside: FloatArray, viewpoint: FloatArray, radius: float, min_planarity: float
+) -> tuple[Float32Array, Float32Array]:
+    """Return normals (N, 3), towards the viewpoint, and planarities (N,) of one stripe from itself and the scans beside it.
+
+    Args:
+        points: (N, 3), the stripe, in map.
+        beside: (M, 3), the points of its neighbouring scans, in map.
+        viewpoint: (3,), the camera centre in map.
+        radius: of the neighbourhood, metres.
+        min_planarity: below it, and where only one scan is near, the normal is (0, 0, 0).
+    """
+    everything = np.concatenate([points, beside])
+    grid = SpatialHash.of(everything, radius)
+    normals, planarity = np.zeros((len(points), 3), np.float32), np.zeros(len(points), np.float32)
+    which = np.arange(len(points))
+    _fit_normals(grid.heads, grid.next, everything, grid.cell_m, which, viewpoint, radius, min_planarity, normals, planarity)
+    return normals, planarity
+
+
+def refine_normals(
+    grid: SpatialHash,
+    positions: FloatArray,
+    which: IntArray,
+    viewpoint: FloatArray,
+    radius: float,
+    min_planarity: float,
+    normals: Float32Array,
+    planarity: Float32Array,
+) -> None:
+    """Fit again, in place, the normals of points ``which`` (K,) of a map: (N, 3) positions and normals, (N,) planarity."""
+    _fit_normals(grid.heads, grid.next, positions, grid.cell_m, which, viewpoint, radius, min_planarity, normals, planarity)
+
+
+@njit(cache=True)
+def _fit_normals(  # type: ignore[no-untyped-def]
+    heads, following, positions, cell_m, which, viewpoint, radius, min_planarity, normals, planarity
+):
+    found = np.empty(MAX_NEIGHBOURS, np.int64)
+    plane = np.empty(8)
+    for index in which:
+        centre = positions[index]
+        count = neighbours(heads, following, positions, centre, radius, cell_m, found)
+        fit_plane(positions, found[:count], centre, plane)
+        planarity[index] = plane[6]
+        # Turning a normal once given by where it is seen from now keeps thin walls from flipping.
+        old = normals[index, 0] ** 2 + normals[index, 1] ** 2 + normals[index, 2] ** 2
+        side = 0.0
+        for axis in range(3):
+            towards = np.float64(normals[index, axis]) if old > 0 else viewpoint[axis] - centre[axis]
+            side += plane[3 + axis] * towards
+        sign = 1.0 if side >= 0 else -1.0
+        good = count >= MIN_NEIGHBOURS and plane[6] >= min_planarity
+        for axis in range(3):
+            normals[index, axis] = sign * plane[3 + axis] if good else 0.0
+
+
+@njit(cache=True)
+def fit_plane(positions, which, origin, plane):  # type: ignore[no-untyped-def]
+    """Fit a plane to points ``which`` (K,) of ``positions``; sums are taken about ``origin`` (3,).
+
+    Writes into ``plane`` (8,): centroid, unit normal, planarity in [0, 1], RMS distance to the plane. Fewer than 3 points: planarity 0.
+    """
+    count = len(which)
+    plane[3:] = 0.0
+    if count < 3:
+        plane[:3] = origin
+        return
+    mean = np.zeros(3)
+    for index in which:
+        for axis in range(3):
+            mean[axis] += positions[index, axis] - origin[axis]
+    mean /= count
+    xx = xy = xz = yy = yz = zz = 0.0
+    for index in which:
+        x = positions[index, 0] - origin[0] - mean[0]
+        y = positions[index, 1] - origin[1] - mean[1]
+        z = positions[index, 2] - origin[2] - mean[2]
+        xx += x * x
+        xy += x * y
+        xz += x * z
+        yy += y * y
+        yz += y * z
+        zz += z * z
+    plane[:3] = origin + mean
+    smallest, middle = smallest_eigenpair(xx / count, xy / count, xz / count, yy / count, yz / count, zz / count, plane[3:6])
+    plane[6] = 1.0 - smallest / middle if middle > 0 else 0.0
+    plane[7] = np.sqrt(smallest)
+
+
+@njit(cache=True)
+def smallest_eigenpair(xx, xy, xz, yy, yz, zz, vector):  # type: ignore[no-untyped-def]
+    """Write the eigenvector of the smallest eigenvalue of a symmetric positive (semi-)definite 3×3; return the two smallest values.
+
+    The closed form of Smith (1961). ``vector`` is zero where the two smallest eigenvalues coincide.
+    """
+    vector[:] = 0.0
+    mean = (xx + yy + zz) / 3
+    off = xy * xy + xz * xz + yz * yz
+    spread = np.sqrt(((xx - mean) ** 2 + (yy - mean) ** 2 + (zz - mean) ** 2 + 2 * off) / 6)
+    if spread <= 1e-12 * mean or mean <= 0:
+        return max(mean, 0.0), max(mean, 0.0)
+    a, b, c, d, e, f = (xx - mean) / spread, xy / spread, xz / spread, (yy - mean) / spread, yz / spread, (zz - mean) / spread
+    half = (a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)) / 2
+    angle = np.arccos(min(1.0, max(-1.0, half))) / 3
+    largest = 2 * np.cos(angle)
+    lowest = 2 * np.cos(angle + 2 * np.pi / 3)
+    # Rows of (B − λ): the longest of their cross products is the best conditioned.
+    a, d, f = a - lowest, d - lowest, f - lowest
+    best = 0.0
+    for x, y, z in (
+        (b * e - c * d, b * c - a * e, a * d - b * b),
+        (b * f - c * e, c * c - a * f, a * e - b * c),
+        (d * f - e * e, c * e - b * f, b * e - c * d),
+    ):
+        norm = x * x + y * y + z * z
+        if norm > best:
+            best = norm
+            vector[0], vector[1], vector[2] = x, y, z
+    if best > 1e-20:
+        vector /= np.sqrt(best)
+    else:
+        vector[:] = 0.0
+    return max(mean + spread * lowest, 0.0), max(mean - spread * (largest + lowest), 0.0)
