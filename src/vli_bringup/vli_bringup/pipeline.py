@@ -97,7 +97,7 @@ class Pipeline:
         return [*events, *self._map(window)]
 
     def _begin_session(self, reason: str) -> list[Event]:
-        """Finish what the old clock began, then let every stage start anew; the map stays."""
+        """Finish what the old clock began, then let every stage start anew."""
         events = self.flush()
         self.session += 1
         self.counters.add("sessions")

@@ -96,7 +96,8 @@ def process(reader: BagReader, pipeline: Pipeline, recorder: Recorder, duration_
     """
     begin_s = time.perf_counter()
     bag_s = 0.0
-    for item, bag_s in _with_progress(reader, duration_s):
+    for item, elapsed_s in _with_progress(reader, duration_s):
+        bag_s = elapsed_s
         recorder.add(pipeline.push(item))
     recorder.add(pipeline.flush())
     end_s = time.perf_counter()
