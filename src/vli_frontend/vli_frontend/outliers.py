@@ -1,0 +1,104 @@
+"""Rejection of tracks that do not fit the motion of the camera between two frames.
+
+With the rotation known from the gyroscope two points fix the direction of translation; a plane is no degenerate case then, and where nothing
+translates every direction fits, so nothing is rejected. Without it, the essential matrix.
+"""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+from numba import njit
+
+from vli_common.arrays import BoolArray, FloatArray, IntArray
+
+_MIN_POINTS = 8
+_HYPOTHESES = 60
+"""Enough for 99 % confidence of an all-inlier pair with 70 % outliers, 1 − (1 − 0.3²)^60."""
+_CONFIDENCE = 0.99
+
+
+class OutlierRejection:
+    """Inliers of the epipolar geometry between consecutive frames.
+
+    Args:
+        threshold: distance to the epipolar line, normalised image plane (pixels over f).
+    """
+
+    def __init__(self, threshold: float) -> None:
+        self._threshold = threshold
+        self._rng = np.random.default_rng(0)
+
+    def reset(self) -> None:
+        """Start the sequence of random choices anew."""
+        self._rng = np.random.default_rng(0)
+
+    def inliers(self, previous: FloatArray, current: FloatArray, rotation: FloatArray | None) -> BoolArray:
+        """Return (N,) True for tracks that fit one motion.
+
+        Args:
+            previous, current: rays (N, 2).
+            rotation: (3, 3) that turns directions of the previous camera into the current one, or None where unknown.
+        """
+        count = len(previous)
+        if count < _MIN_POINTS:
+            return np.ones(count, np.bool_)
+        if rotation is None:
+            return _essential_inliers(previous, current, self._threshold)
+        pairs = self._rng.integers(0, count, (_HYPOTHESES, 2))
+        return translation_inliers(previous, current, np.ascontiguousarray(rotation), pairs, self._threshold)
+
+
+def _essential_inliers(previous: FloatArray, current: FloatArray, threshold: float) -> BoolArray:
+    _, mask = cv2.findEssentialMat(previous, current, np.eye(3), method=cv2.RANSAC, prob=_CONFIDENCE, threshold=threshold)
+    return np.ones(len(previous), np.bool_) if mask is None else mask.ravel().astype(np.bool_)
+
+
+@njit(cache=True)
+def translation_inliers(previous: FloatArray, current: FloatArray, rotation: FloatArray, pairs: IntArray, threshold: float) -> BoolArray:
+    """Return (N,) True within ``threshold`` of the epipolar line of the best translation; hypotheses are pairs (M, 2) of indices."""
+    turned = np.empty((len(previous), 3))
+    for n in range(len(previous)):
+        for i in range(3):
+            turned[n, i] = rotation[i, 0] * previous[n, 0] + rotation[i, 1] * previous[n, 1] + rotation[i, 2]
+    best, best_score = np.zeros(3), -1.0
+    for m in range(len(pairs)):
+        first, second = _epipolar_normal(turned, current, pairs[m, 0]), _epipolar_normal(turned, current, pairs[m, 1])
+        direction = _cross(first, second)
+        norm = math.sqrt(direction[0] ** 2 + direction[1] ** 2 + direction[2] ** 2)
+        if norm < 1e-12:
+            continue
+        direction /= norm
+        score = 0.0
+        for n in range(len(previous)):
+            error = _line_distance(turned[n], current[n], direction) / threshold
+            score += max(0.0, 1.0 - error * error)
+        if score > best_score:
+            best, best_score = direction, score
+    inliers = np.ones(len(previous), np.bool_)
+    if best_score >= 0.0:
+        for n in range(len(previous)):
+            inliers[n] = _line_distance(turned[n], current[n], best) <= threshold
+    return inliers
+
+
+@njit(cache=True)
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+@njit(cache=True)
+def _epipolar_normal(turned: FloatArray, current: FloatArray, n: int) -> FloatArray:
+    return _cross(turned[n], np.array([current[n, 0], current[n, 1], 1.0]))
+
+
+@njit(cache=True)
+def _line_distance(turned: FloatArray, current: FloatArray, direction: FloatArray) -> float:
+    """Return the distance of a ray from the epipolar line of its (rotated) partner, normalised image plane."""
+    a = direction[1] * turned[2] - direction[2] * turned[1]
+    b = direction[2] * turned[0] - direction[0] * turned[2]
+    c = direction[0] * turned[1] - direction[1] * turned[0]
+    norm = math.sqrt(a * a + b * b)
+    return abs(a * current[0] + b * current[1] + c) / norm if norm > 1e-12 else 0.0

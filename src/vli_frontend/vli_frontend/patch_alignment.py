@@ -1,0 +1,264 @@
+"""Alignment of each track to the patch seen at its birth: affine warp, gain, bias and a gain that slopes across the patch.
+
+Inverse-compositional (Baker and Matthews, 2004). The image under the warp is modelled as
+
+    I(W(x)) = g T(Δ(x)) + b + (s_u u + s_v v) T(x),   Δ(x) = x + t + M (u, v)
+
+with u, v the offsets over the half width, which is linear in (g t, g M, g, b, s): the rows gx, gy, gx·u, gx·v, gy·u, gy·v, T − mean(T), 1,
+u·T, v·T, their weighted normal matrix and its inverse are fixed at birth. Without the slope of the gain an on-board light leaves twice the drift.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from vli_common.arrays import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
+
+RADIUS = 10
+"""Half width of a patch, pixels."""
+MARGIN_PX = RADIUS + 2
+"""A patch needs this distance from the image border (one pixel more than it covers, for the gradient)."""
+_SIDE = 2 * RADIUS + 1
+_PIXELS = _SIDE * _SIDE
+_UNKNOWNS = 10
+_WEIGHT_SIGMA_PX = 5.0
+_CONVERGED_PX = 0.01
+_ITERATIONS = 10
+
+_V, _U = (grid.ravel().astype(np.float32) for grid in np.mgrid[-RADIUS : RADIUS + 1, -RADIUS : RADIUS + 1] / RADIUS)
+_WEIGHT = np.exp(-0.5 * (RADIUS / _WEIGHT_SIGMA_PX) ** 2 * (_U**2 + _V**2)).astype(np.float32)
+
+
+@dataclass(frozen=True, slots=True)
+class Aligned:
+    """Where the patches were found.
+
+    Args:
+        pixels: (N, 2), the start where not converged.
+        affine: (N, 2, 2), patch at birth → image.
+        converged: (N,).
+        correlation: (N,), weighted, of the patch with the one at birth under the fitted light.
+    """
+
+    pixels: FloatArray
+    affine: FloatArray
+    converged: BoolArray
+    correlation: FloatArray
+
+
+class PatchTemplates:
+    """The patches seen at birth, in numbered slots.
+
+    Args:
+        capacity: number of slots.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self._solvers = np.zeros((capacity, _UNKNOWNS, _PIXELS), np.float32)
+        self._patches = np.zeros((capacity, _PIXELS), np.float32)
+        self.valid = np.zeros(capacity, np.bool_)
+        """(capacity,): False where the texture determines no position."""
+        self.sigma_per_level = np.full(capacity, np.inf)
+        """(capacity,): standard deviation of the position per axis, in pixels for one grey level of white noise (Cramér–Rao bound)."""
+
+    def create(self, grey: ByteArray, slots: IntArray, pixels: FloatArray) -> None:
+        """Take new patches around ``pixels`` (N, 2) into ``slots`` (N,); all at least :data:`MARGIN_PX` inside the image."""
+        _create(grey, slots, pixels, self._solvers, self._patches, self.valid, self.sigma_per_level)
+
+    def align(self, grey: ByteArray, slots: IntArray, start: FloatArray, affine: FloatArray) -> Aligned:
+        """Find the patches of ``slots`` (N,) from positions (N, 2) and affine warps (N, 2, 2)."""
+        pixels, warps = start.copy(), affine.copy()
+        converged, correlation = np.zeros(len(slots), np.bool_), np.zeros(len(slots))
+        _align(grey, slots, self._solvers, self._patches, self.valid, pixels, warps, converged, correlation)
+        return Aligned(pixels, warps, converged, correlation)
+
+
+@njit(cache=True, fastmath=True)
+def _sample(grey: ByteArray, x: float, y: float, warp: FloatArray, out: Float32Array) -> None:
+    """Write the bilinear values (_PIXELS,) of the image under the warp; beyond the border its edge is repeated."""
+    height, width = grey.shape
+    limit_x, limit_y = np.float32(width - 1.001), np.float32(height - 1.001)
+    zero, one = np.float32(0.0), np.float32(1.0)
+    a, b, c, d = np.float32(warp[0, 0]), np.float32(warp[0, 1]), np.float32(warp[1, 0]), np.float32(warp[1, 1])
+    k = 0
+    for j in range(-RADIUS, RADIUS + 1):
+        row_x, row_y = np.float32(x) + b * np.float32(j), np.float32(y) + d * np.float32(j)
+        for i in range(-RADIUS, RADIUS + 1):
+            px = min(max(row_x + a * np.float32(i), zero), limit_x)
+            py = min(max(row_y + c * np.float32(i), zero), limit_y)
+            ix, iy = int(px), int(py)
+            fx, fy = px - np.float32(ix), py - np.float32(iy)
+            top = (one - fx) * np.float32(grey[iy, ix]) + fx * np.float32(grey[iy, ix + 1])
+            bottom = (one - fx) * np.float32(grey[iy + 1, ix]) + fx * np.float32(grey[iy + 1, ix + 1])
+            out[k] = (one - fy) * top + fy * bottom
+            k += 1
+
+
+@njit(cache=True, fastmath=True)
+def _fill_rows(grey: ByteArray, x: float, y: float, patch: Float32Array, rows: FloatArray) -> None:
+    """Write the patch (_PIXELS,) and the rows (_UNKNOWNS, _PIXELS) of the linear model at one point."""
+    identity = np.eye(2)
+    sides = np.empty((4, _PIXELS), np.float32)
+    _sample(grey, x, y, identity, patch)
+    _sample(grey, x - 1, y, identity, sides[0])
+    _sample(grey, x + 1, y, identity, sides[1])
+    _sample(grey, x, y - 1, identity, sides[2])
+    _sample(grey, x, y + 1, identity, sides[3])
+    mean = 0.0
+    for k in range(_PIXELS):
+        mean += patch[k] / _PIXELS
+    for k in range(_PIXELS):
+        gx, gy = 0.5 * (sides[1, k] - sides[0, k]), 0.5 * (sides[3, k] - sides[2, k])
+        rows[0, k], rows[1, k] = gx, gy
+        rows[2, k], rows[3, k] = gx * _U[k], gx * _V[k]
+        rows[4, k], rows[5, k] = gy * _U[k], gy * _V[k]
+        rows[6, k], rows[7, k] = patch[k] - mean, 1.0
+        rows[8, k], rows[9, k] = _U[k] * patch[k], _V[k] * patch[k]
+
+
+@njit(cache=True)
+def _invert(matrix: FloatArray) -> bool:
+    """Invert a symmetric positive definite matrix in place (Gauss–Jordan); False where it is not one, to rounding."""
+    n = len(matrix)
+    scale = np.empty(n)
+    for i in range(n):
+        if matrix[i, i] <= 0.0:
+            return False
+        scale[i] = 1.0 / math.sqrt(matrix[i, i])
+    for i in range(n):
+        for j in range(n):
+            matrix[i, j] *= scale[i] * scale[j]
+    for i in range(n):
+        pivot = matrix[i, i]
+        if pivot < 1e-6:
+            return False
+        matrix[i, i] = 1.0
+        for j in range(n):
+            matrix[i, j] /= pivot
+        for k in range(n):
+            if k != i:
+                factor = matrix[k, i]
+                matrix[k, i] = 0.0
+                for j in range(n):
+                    matrix[k, j] -= factor * matrix[i, j]
+    for i in range(n):
+        for j in range(n):
+            matrix[i, j] *= scale[i] * scale[j]
+    return True
+
+
+@njit(cache=True, fastmath=True)
+def _create(
+    grey: ByteArray, slots: IntArray, pixels: FloatArray, solvers: Float32Array, patches: Float32Array, valid: BoolArray, sigma: FloatArray
+) -> None:
+    rows = np.empty((_UNKNOWNS, _PIXELS))
+    normal = np.empty((_UNKNOWNS, _UNKNOWNS))
+    for n in range(len(slots)):
+        slot = slots[n]
+        _fill_rows(grey, pixels[n, 0], pixels[n, 1], patches[slot], rows)
+        for i in range(_UNKNOWNS):
+            for j in range(i + 1):
+                total = 0.0
+                for k in range(_PIXELS):
+                    total += rows[i, k] * rows[j, k] * _WEIGHT[k]
+                normal[i, j] = normal[j, i] = total
+        valid[slot] = _invert(normal)
+        sigma[slot] = np.inf
+        if not valid[slot]:
+            continue
+        for i in range(_UNKNOWNS):
+            for k in range(_PIXELS):
+                total = 0.0
+                for j in range(_UNKNOWNS):
+                    total += normal[i, j] * rows[j, k]
+                solvers[slot, i, k] = total * _WEIGHT[k]
+        variance = 0.0
+        for i in range(2):
+            for k in range(_PIXELS):
+                variance += 0.5 * solvers[slot, i, k] ** 2
+        sigma[slot] = math.sqrt(variance)
+
+
+@njit(cache=True, fastmath=True)
+def _solve(solver: Float32Array, values: Float32Array, unknowns: FloatArray) -> None:
+    for i in range(_UNKNOWNS):
+        total = np.float32(0.0)
+        for k in range(_PIXELS):
+            total += solver[i, k] * values[k]
+        unknowns[i] = total
+
+
+@njit(cache=True)
+def _compose(pixel: FloatArray, warp: FloatArray, unknowns: FloatArray) -> float:
+    """Compose the warp with the inverse of the increment, W ← W ∘ Δ⁻¹; return the step of the centre in pixels."""
+    gain = unknowns[6]
+    tx, ty = unknowns[0] / gain, unknowns[1] / gain
+    a, b = 1.0 + unknowns[2] / gain / RADIUS, unknowns[3] / gain / RADIUS
+    c, d = unknowns[4] / gain / RADIUS, 1.0 + unknowns[5] / gain / RADIUS
+    det = a * d - b * c
+    if abs(det) < 0.1:
+        return np.inf
+    for i in range(2):
+        left, right = (warp[i, 0] * d - warp[i, 1] * c) / det, (warp[i, 1] * a - warp[i, 0] * b) / det
+        warp[i, 0], warp[i, 1] = left, right
+        pixel[i] -= left * tx + right * ty
+    return math.hypot(tx, ty)
+
+
+@njit(cache=True, fastmath=True)
+def _correlation(patch: Float32Array, values: Float32Array, unknowns: FloatArray) -> float:
+    """Return the weighted correlation of the values with the patch under the fitted light."""
+    mean = 0.0
+    for k in range(_PIXELS):
+        mean += patch[k] / _PIXELS
+    weights, sum_m, sum_v, sum_mm, sum_vv, sum_mv = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(_PIXELS):
+        model = unknowns[6] * (patch[k] - mean) + (unknowns[8] * _U[k] + unknowns[9] * _V[k]) * patch[k]
+        value, weight = values[k], _WEIGHT[k]
+        weights += weight
+        sum_m += weight * model
+        sum_v += weight * value
+        sum_mm += weight * model * model
+        sum_vv += weight * value * value
+        sum_mv += weight * model * value
+    product = (sum_mm * weights - sum_m * sum_m) * (sum_vv * weights - sum_v * sum_v)
+    return (sum_mv * weights - sum_m * sum_v) / math.sqrt(product) if product > 0.0 else 0.0
+
+
+@njit(cache=True)
+def _align(
+    grey: ByteArray,
+    slots: IntArray,
+    solvers: Float32Array,
+    patches: Float32Array,
+    valid: BoolArray,
+    pixels: FloatArray,
+    warps: FloatArray,
+    converged: BoolArray,
+    correlation: FloatArray,
+) -> None:
+    values, unknowns = np.empty(_PIXELS, np.float32), np.empty(_UNKNOWNS)
+    for n in range(len(slots)):
+        slot = slots[n]
+        if not valid[slot]:
+            continue
+        start_x, start_y = pixels[n, 0], pixels[n, 1]
+        for _ in range(_ITERATIONS):
+            _sample(grey, pixels[n, 0], pixels[n, 1], warps[n], values)
+            _solve(solvers[slot], values, unknowns)
+            # A gain near zero or negative is another patch; so is one that ran away.
+            if not 0.1 < unknowns[6] < 10.0:
+                break
+            step = _compose(pixels[n], warps[n], unknowns)
+            if not math.hypot(pixels[n, 0] - start_x, pixels[n, 1] - start_y) < RADIUS:
+                break
+            if step < _CONVERGED_PX:
+                converged[n] = True
+                correlation[n] = _correlation(patches[slot], values, unknowns)
+                break
+        if not converged[n]:
+            pixels[n, 0], pixels[n, 1] = start_x, start_y

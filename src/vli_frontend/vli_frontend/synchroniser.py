@@ -1,0 +1,189 @@
+"""Brings long frames and IMU samples together: a frame goes on once the IMU covers its stamp, ``t_imu = t_cam + timeshift``."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from vli_common.arrays import FloatArray, IntArray
+from vli_common.types import NANOSECONDS, Counters, Image, ImuSample
+
+_CAPACITY = 8192
+_MAX_WAITING = 32
+
+
+@dataclass(frozen=True, slots=True)
+class ImuSegment:
+    """The IMU between two instants, whose own values are interpolated.
+
+    Args:
+        stamps: (M,) int64, IMU clock, first and last are the ends asked for; M ≥ 2.
+        gyro: (M, 3) rad/s.
+        accel: (M, 3) m/s².
+        longest_gap_ns: between consecutive samples that the segment rests on.
+    """
+
+    stamps: IntArray
+    gyro: FloatArray
+    accel: FloatArray
+    longest_gap_ns: int
+
+    @property
+    def mean_rate(self) -> FloatArray:
+        """Mean angular rate (3,) rad/s, by the trapezoidal rule."""
+        dt = np.diff(self.stamps) * 1e-9
+        result: FloatArray = (0.5 * (self.gyro[1:] + self.gyro[:-1]) * dt[:, None]).sum(axis=0) / dt.sum()
+        return result
+
+
+class ImuHistory:
+    """The newest IMU samples, strictly ascending in time; at most ``_CAPACITY`` (40 s at 200 Hz)."""
+
+    def __init__(self) -> None:
+        self._stamps = np.empty(2 * _CAPACITY, np.int64)
+        self._values = np.empty((2 * _CAPACITY, 6))
+        self._count = 0
+
+    @property
+    def newest_ns(self) -> int | None:
+        """Newest stamp, IMU clock."""
+        return int(self._stamps[self._count - 1]) if self._count else None
+
+    def first_from(self, stamp_ns: int) -> int | None:
+        """Return the first stamp at or after ``stamp_ns``."""
+        index = int(np.searchsorted(self._stamps[: self._count], stamp_ns, side="left"))
+        return int(self._stamps[index]) if index < self._count else None
+
+    def append(self, sample: ImuSample) -> None:
+        """Add a sample newer than all others."""
+        if self._count == len(self._stamps):
+            self._stamps[:_CAPACITY], self._values[:_CAPACITY] = self._stamps[_CAPACITY:], self._values[_CAPACITY:]
+            self._count = _CAPACITY
+        self._stamps[self._count] = sample.stamp_ns
+        self._values[self._count, :3], self._values[self._count, 3:] = sample.gyro, sample.accel
+        self._count += 1
+
+    def clear(self) -> None:
+        """Forget all samples."""
+        self._count = 0
+
+    def segment(self, begin_ns: int, end_ns: int) -> ImuSegment | None:
+        """Return the IMU from ``begin_ns`` to ``end_ns`` (IMU clock), or None where the samples do not reach around both."""
+        stamps = self._stamps[: self._count]
+        first = int(np.searchsorted(stamps, begin_ns, side="right")) - 1
+        last = int(np.searchsorted(stamps, end_ns, side="left"))
+        if end_ns <= begin_ns or first < 0 or last >= self._count:
+            return None
+        inside = slice(first + 1, last)
+        ends = np.stack([self._at(first, begin_ns), self._at(last - 1, end_ns)])
+        values = np.concatenate([ends[:1], self._values[inside], ends[1:]])
+        longest = int(np.diff(stamps[first : last + 1]).max())
+        return ImuSegment(np.concatenate([[begin_ns], stamps[inside], [end_ns]]), values[:, :3], values[:, 3:], longest)
+
+    def _at(self, index: int, stamp_ns: int) -> FloatArray:
+        """Return the values at a stamp between samples ``index`` and ``index + 1``."""
+        before, after = int(self._stamps[index]), int(self._stamps[index + 1])
+        alpha = (stamp_ns - before) / (after - before)
+        result: FloatArray = (1.0 - alpha) * self._values[index] + alpha * self._values[index + 1]
+        return result
+
+
+class Waiting(Enum):
+    """Why no frame goes on."""
+
+    NO_FRAME = "no long frame waits"
+    NO_IMU = "no IMU sample has come yet"
+    IMU_BEHIND = "the IMU does not reach the frame yet"
+
+
+@dataclass(frozen=True, slots=True)
+class ReadyFrame:
+    """A long frame that may go on; ``covered`` tells whether the IMU reaches its stamp."""
+
+    image: Image
+    covered: bool
+
+
+class Synchroniser:
+    """Holds long frames until the IMU covers them; keeps both in strict order.
+
+    What is out of order, duplicated or not finite is dropped and counted. A frame waits at most ``max_wait_ns`` of data time (of IMU or of later
+    frames): then it goes on without the IMU, so that a dead IMU does not stop the camera, and no result depends on what comes later.
+
+    Args:
+        timeshift_ns: ``t_imu = t_cam + timeshift``.
+        max_wait_ns: see above.
+        uses_imu: False releases each frame at once.
+        counters: of the stage.
+    """
+
+    def __init__(self, timeshift_ns: int, max_wait_ns: int, uses_imu: bool, counters: Counters) -> None:
+        self.imu = ImuHistory()
+        self._timeshift_ns, self._max_wait_ns, self._uses_imu = timeshift_ns, max_wait_ns, uses_imu
+        self._counters = counters
+        self._waiting: deque[Image] = deque()
+        self._newest_frame_ns: int | None = None
+
+    def clear(self) -> None:
+        """Forget everything: a new session begins."""
+        self.imu.clear()
+        self._waiting.clear()
+        self._newest_frame_ns = None
+
+    def add_imu(self, sample: ImuSample) -> bool:
+        """Take a sample; False where it was dropped."""
+        if not (np.isfinite(sample.gyro).all() and np.isfinite(sample.accel).all()):
+            return self._drop("imu_not_finite")
+        newest = self.imu.newest_ns
+        if newest is not None and sample.stamp_ns <= newest:
+            return self._drop("imu_duplicate" if sample.stamp_ns == newest else "imu_out_of_order")
+        self.imu.append(sample)
+        return True
+
+    def add_frame(self, image: Image) -> bool:
+        """Take a long frame; False where it was dropped."""
+        newest = self._newest_frame_ns
+        if newest is not None and image.stamp_ns <= newest:
+            return self._drop("frames_duplicate" if image.stamp_ns == newest else "frames_out_of_order")
+        self._newest_frame_ns = image.stamp_ns
+        self._waiting.append(image)
+        if len(self._waiting) > _MAX_WAITING:
+            self._waiting.popleft()
+            self._counters.add("frames_overrun")
+        return True
+
+    def next(self) -> ReadyFrame | Waiting:
+        """Return the oldest frame once it may go on, or why it may not."""
+        if not self._waiting:
+            return Waiting.NO_FRAME
+        if not self._uses_imu:
+            return ReadyFrame(self._waiting.popleft(), covered=False)
+        stamp_ns = self.to_imu_clock(self._waiting[0].stamp_ns)
+        deadline_ns = stamp_ns + self._max_wait_ns
+        next_ns = self.imu.first_from(stamp_ns)
+        if next_ns is not None and next_ns <= deadline_ns:
+            return ReadyFrame(self._waiting.popleft(), covered=True)
+        if next_ns is not None or self.to_imu_clock(self._waiting[-1].stamp_ns) > deadline_ns:
+            self._counters.add("frames_without_imu")
+            return ReadyFrame(self._waiting.popleft(), covered=False)
+        return Waiting.NO_IMU if self.imu.newest_ns is None else Waiting.IMU_BEHIND
+
+    def to_imu_clock(self, stamp_ns: int) -> int:
+        """Return a camera stamp on the clock of the IMU."""
+        return stamp_ns + self._timeshift_ns
+
+    def segment(self, begin_ns: int, end_ns: int) -> ImuSegment | None:
+        """Return the IMU between two camera stamps, or None where it does not cover them."""
+        return self.imu.segment(self.to_imu_clock(begin_ns), self.to_imu_clock(end_ns))
+
+    def _drop(self, counter: str) -> bool:
+        self._counters.add(counter)
+        return False
+
+
+def seconds_to_ns(seconds: float) -> int:
+    """Return whole nanoseconds."""
+    return round(seconds * NANOSECONDS)
