@@ -65,7 +65,7 @@ def _refine(  # type: ignore[no-untyped-def]
     relative_r, relative_t, use, anchor, anchor_ray, rho, prior, rays, sigma, depth, depth_sigma, cauchy, limits, iterations
 ):
     """Minimise the cost of every landmark over its own ρ, poses fixed; writes ``rho`` and returns its information (L,)."""
-    count, slots = sigma.shape
+    count, slots = len(sigma), len(relative_r)
     information = np.zeros(count)
     for i in range(count):
         if not use[i]:
@@ -134,7 +134,7 @@ def _add_row(hessian, gradient, coupling, row, e, w, jr, a, j):  # type: ignore[
 def _condense(  # type: ignore[no-untyped-def]
     relative_r, relative_t, use, anchor, anchor_ray, rho, prior, rays, sigma, depth, depth_sigma, cauchy, hessian, gradient
 ):
-    count, slots = sigma.shape
+    count, slots = len(sigma), len(relative_r)
     row, coupling = np.zeros(12), np.empty(6 * slots)
     cost = 0.0
     for i in range(count):
@@ -222,6 +222,10 @@ class LandmarkArrays:
     depth: FloatArray
     depth_sigma: FloatArray
 
+    def columns(self) -> tuple[AnyArray, ...]:
+        """Return the arrays in the order in which the kernels take them."""
+        return (self.anchor, self.anchor_ray, self.rho, self.prior, self.rays, self.sigma, self.depth, self.depth_sigma)
+
 
 def refine(
     landmarks: LandmarkArrays,
@@ -232,50 +236,20 @@ def refine(
     iterations: int = 5,
 ) -> FloatArray:
     """Solve every used landmark for its own inverse depth, poses (K, 4, 4) fixed; return the information of ρ (L,), m²."""
-    rotations, translations = np.ascontiguousarray(T_map_camera[:, :3, :3]), np.ascontiguousarray(T_map_camera[:, :3, 3])
-    k = len(rotations)
-    m = landmarks
-    relative_r, relative_t = _relative_poses(rotations, translations)
-    information: FloatArray = _refine(
-        relative_r,
-        relative_t,
-        use,
-        m.anchor,
-        m.anchor_ray,
-        m.rho,
-        m.prior,
-        m.rays[:, :k],
-        m.sigma[:, :k],
-        m.depth[:, :k],
-        m.depth_sigma[:, :k],
-        cauchy,
-        limits,
-        iterations,
-    )
+    information: FloatArray = _refine(*_pairs(T_map_camera), use, *landmarks.columns(), cauchy, limits, iterations)
     return information
 
 
 def condense(landmarks: LandmarkArrays, T_map_camera: FloatArray, use: BoolArray, cauchy: float) -> Quadratic:
     """Return eqs. (2) and (3) of the used landmarks as a quadratic in the K camera poses (K, 4, 4), depths eliminated."""
-    rotations, translations = np.ascontiguousarray(T_map_camera[:, :3, :3]), np.ascontiguousarray(T_map_camera[:, :3, 3])
-    k = len(rotations)
-    hessian, gradient = np.zeros((6 * k, 6 * k)), np.zeros(6 * k)
-    m = landmarks
-    relative_r, relative_t = _relative_poses(rotations, translations)
-    cost = _condense(
-        relative_r,
-        relative_t,
-        use,
-        m.anchor,
-        m.anchor_ray,
-        m.rho,
-        m.prior,
-        m.rays[:, :k],
-        m.sigma[:, :k],
-        m.depth[:, :k],
-        m.depth_sigma[:, :k],
-        cauchy,
-        hessian,
-        gradient,
-    )
+    size = 6 * len(T_map_camera)
+    hessian, gradient = np.zeros((size, size)), np.zeros(size)
+    cost = _condense(*_pairs(T_map_camera), use, *landmarks.columns(), cauchy, hessian, gradient)
     return Quadratic(hessian, gradient, float(cost))
+
+
+def _pairs(T_map_camera: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return R_ja (K, K, 3, 3) and t_ja (K, K, 3) between all pairs of poses (K, 4, 4)."""
+    rotations, translations = np.ascontiguousarray(T_map_camera[:, :3, :3]), np.ascontiguousarray(T_map_camera[:, :3, 3])
+    relative_r, relative_t = _relative_poses(rotations, translations)
+    return relative_r, relative_t
