@@ -71,7 +71,7 @@ class LatencyMeter:
         """Return (p50, p99) in milliseconds, or None before the first sample."""
         if not self._seconds:
             return None
-        p50, p99 = np.percentile(np.array(self._seconds), [50, 99]) * 1e3
+        p50, p99 = np.percentile(list(self._seconds), [50, 99]) * 1e3
         return float(p50), float(p99)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -110,6 +111,37 @@ def encoded_from_message(message: ImageMessage | CompressedImage) -> EncodedImag
         return EncodedImage(stamp_ns, message.data.tobytes(), message.format, compressed=True)
     _check_image_size(message, 1)
     return EncodedImage(stamp_ns, message.data.tobytes(), message.encoding, message.width, message.height, message.step)
+
+
+def exposure_to_message(image: EncodedImage) -> DiagnosticArray:
+    """Return ``/camera/exposure`` of a frame; a key whose value is not known is left out."""
+    values = []
+    if image.exposure_s is not None:
+        values.append(KeyValue(key="exposure_s", value=repr(image.exposure_s)))
+    if image.laser_on is not None:
+        values.append(KeyValue(key="laser", value="on" if image.laser_on else "off"))
+    return DiagnosticArray(header=header(image.stamp_ns, CAMERA_FRAME), status=[DiagnosticStatus(name="exposure", values=values)])
+
+
+def exposure_from_message(message: DiagnosticArray) -> tuple[int, float | None, bool | None]:
+    """Return stamp, exposure in seconds and laser state of a frame, None where not told.
+
+    Raises:
+        MessageError: not one status, or a value that is no exposure or no laser state.
+    """
+    if len(message.status) != 1:
+        raise MessageError(f"exposure has '{len(message.status)}' statuses, expected 1")
+    values = {pair.key: pair.value for pair in message.status[0].values}
+    laser = values.get("laser")
+    if laser not in (None, "on", "off"):
+        raise MessageError(f"exposure has laser '{laser}', expected on or off")
+    try:
+        exposure_s = float(values["exposure_s"]) if "exposure_s" in values else None
+    except ValueError:
+        exposure_s = -1.0
+    if exposure_s is not None and not 0 < exposure_s < math.inf:
+        raise MessageError(f"exposure has exposure_s '{values['exposure_s']}', expected seconds above 0")
+    return from_time(message.header.stamp), exposure_s, None if laser is None else laser == "on"
 
 
 def _check_image_size(message: ImageMessage, bytes_per_pixel: int) -> None:

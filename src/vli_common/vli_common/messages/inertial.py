@@ -18,6 +18,7 @@ from geometry_msgs.msg import TwistStamped
 from sensor_msgs.msg import Imu, PointCloud2
 
 from vli_common.errors import MessageError
+from vli_common.frame_pairing import NoPreintegration
 from vli_common.messages.basics import from_time, header
 from vli_common.messages.pointcloud import cloud_from_rows, cloud_session, field_count, rows_from_cloud
 from vli_common.messages.poses import from_vector, to_vector
@@ -83,12 +84,20 @@ def preintegration_to_message(preintegration: Preintegration) -> PointCloud2:
     return cloud_from_rows(row, header(preintegration.stamp_ns, IMU_FRAME), preintegration.session)
 
 
-def preintegration_from_message(message: PointCloud2) -> Preintegration:
-    """Return a preintegration that is safe to use.
+def no_preintegration_message(stamp_ns: int, session: int) -> PointCloud2:
+    """Return ``preintegration`` of a frame that has none (the first one, or a mode without IMU): no rows."""
+    return cloud_from_rows(np.zeros(0, preintegration_fields(1)), header(stamp_ns, IMU_FRAME), session)
+
+
+def preintegration_from_message(message: PointCloud2) -> Preintegration | NoPreintegration:
+    """Return a preintegration that is safe to use, or the note that there is none.
 
     Raises:
         MessageError: malformed, wrong checksum, not finite, or a time span that is not the interval it is sent for.
     """
+    if message.width * message.height == 0:
+        rows = rows_from_cloud(message, preintegration_fields(1))
+        return NoPreintegration(from_time(message.header.stamp), cloud_session(message, rows))
     size = field_count(message, "data")
     if not 0 < size <= _MAX_ARCHIVE_BYTES:
         raise MessageError(f"preintegration has '{size}' bytes of data, expected 1 to {_MAX_ARCHIVE_BYTES}")

@@ -1,0 +1,422 @@
+"""The base of every node: decode → call → publish is all that is left to the node itself.
+
+Callbacks only enqueue; a worker thread decodes and computes, so that 25 ms of work on an image never holds up the IMU.
+"""
+
+from __future__ import annotations
+
+import time
+import traceback
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+import rclpy
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.subscription import Subscription
+from std_msgs.msg import Header, String
+from std_srvs.srv import Trigger
+
+from vli_common.calibration import Calibration, load_calibration, parse_calibration, to_yaml
+from vli_common.errors import CalibrationError, MessageError
+from vli_common.messages import Session, session_from_message, session_to_message, status_from_message, status_to_message
+from vli_common.node.parameters import NodeConfig, NodeParameters
+from vli_common.node.transport import message_type, quality
+from vli_common.node.worker import Worker
+from vli_common.status import Health, LatencyMeter, NodeState, RateMeter, StageStatus
+from vli_common.topics import CALIBRATION, DIAGNOSTICS, NAMESPACE, SESSION, STATUS, Topic
+from vli_common.types import Counters, Mode
+
+T = TypeVar("T")
+
+_STATUS_PERIOD_S = 1.0
+_FINISH_PERIOD_S = 0.1
+_QUIET_S = 1.0
+"""An input that fell short of what its source sent is given up after this long without a message."""
+_QUEUE_DEPTHS = 6
+"""The worker's queue holds this many times the depth of the topic."""
+_STOP_S = 2.0
+
+
+@dataclass
+class _Input:
+    """One subscription with its bookkeeping; ``ends`` and ``required`` as in :meth:`VliNode.receive`."""
+
+    topic: Topic
+    name: str
+    ends: bool
+    required: bool
+    subscription: Subscription | None = None
+    rate: RateMeter = field(default_factory=RateMeter)
+    received: int = 0
+    last_s: float = field(default_factory=time.monotonic)
+
+
+class VliNode(Node):
+    """Parameters, calibration, session, worker, status, services.
+
+    A subclass makes its publishers and calls :meth:`receive` in its constructor, and overrides the hooks (``create_stage`` …
+    ``stage_health``), all of which run in the worker thread.
+
+    Args:
+        name: of the executable.
+        configs: config dataclass → prefix of its parameters (``""`` for none).
+        needs_calibration: False for a node that works without one.
+
+    Raises:
+        ConfigError: an invalid parameter.
+        CalibrationError: an invalid calibration file.
+    """
+
+    def __init__(self, name: str, configs: Mapping[type, str], needs_calibration: bool = True) -> None:
+        super().__init__(name, namespace=NAMESPACE)
+        self.parameters = NodeParameters(self, configs)
+        self.node_config = self.parameters.config(NodeConfig)
+        self.mode = Mode(self.node_config.mode)
+        self.calibration: Calibration | None = None
+        self.session = 0
+        self._newest_session = 0
+        self.counters = Counters()
+        self.latency = LatencyMeter()
+        self.state = NodeState.WAITING if needs_calibration else NodeState.WARMING
+        self.failure: str | None = None
+        self._needs_calibration = needs_calibration
+        self._hint = "waiting for a calibration: give 'calibration_file' to the driver node or to this one"
+        self._calibration_hint = ""
+        self._worker = Worker(name, self.fail)
+        self._inputs: dict[str, _Input] = {}
+        self._publishers_by_topic: dict[str, Publisher] = {}
+        self._sent = Counters()
+        self._finished_sources: dict[str, dict[str, str]] = {}
+        self.others: dict[str, StageStatus] = {}
+        """The newest status of each node, this one too."""
+        if self.node_config.calibration_file:
+            self.calibration = self._load_calibration()
+        self._connect()
+
+    # Hooks
+
+    def create_stage(self, calibration: Calibration | None) -> None:
+        """Make the stage objects (again, where parameters have changed) and warm their kernels."""
+
+    def on_session(self, session: Session) -> None:
+        """Drop all state of other sessions; ``self.session`` is the new one."""
+
+    def on_pause(self) -> None:
+        """Bring to an end what is under way."""
+
+    def on_resume(self) -> None:
+        """Go on after a pause."""
+
+    def on_finish(self) -> None:
+        """Process what is still held back: the input has ended."""
+
+    def stage_counters(self) -> Counters:
+        """Return the counters of the stage."""
+        return Counters()
+
+    def stage_status(self) -> tuple[Health, str, dict[str, str]]:
+        """Return the stage's health, a hint in words, and further values."""
+        return Health.OK, "", {}
+
+    # What a node does with topics
+
+    def receive(
+        self,
+        topic: Topic,
+        read: Callable[[Any], T],
+        handle: Callable[[T], None],
+        name: str | None = None,
+        ends: bool = True,
+        required: bool = True,
+    ) -> None:
+        """Subscribe; ``read`` and ``handle`` run in the worker.
+
+        Args:
+            topic: of the table.
+            read: message → type; what it refuses is dropped and counted.
+            handle: gets what is of the present session.
+            name: to subscribe to in place of the topic's own.
+            ends: False for feedback, which does not tell the end of the input.
+            required: False for an input that may have no publisher.
+        """
+        entry = _Input(topic, name or topic.name, ends, required)
+        limit = _QUEUE_DEPTHS * topic.depth
+
+        def callback(message: Any) -> None:
+            entry.rate.add()
+            entry.received += 1
+            entry.last_s = time.monotonic()
+            self._worker.put(topic.name, partial(self._process, entry, read, handle, message, entry.last_s), limit)
+
+        entry.subscription = self.create_subscription(message_type(topic), entry.name, callback, quality(topic))
+        self._inputs[topic.name] = entry
+
+    def advertise(self, topic: Topic, name: str | None = None) -> Publisher:
+        """Make the publisher of a topic, for :meth:`send`."""
+        publisher = self.create_publisher(message_type(topic), name or topic.name, quality(topic))
+        self._publishers_by_topic[topic.name] = publisher
+        return publisher
+
+    def send(self, topic: Topic, message: Any) -> None:
+        """Publish, and count for those downstream; a node that is being stopped publishes nothing more."""
+        self._sent.add(topic.name)
+        try:
+            self._publishers_by_topic[topic.name].publish(message)
+        except Exception:
+            if rclpy.ok():
+                raise
+
+    def has_listener(self, topic: Topic) -> bool:
+        """Return True where anyone subscribes to a topic of :meth:`advertise`."""
+        return bool(self._publishers_by_topic[topic.name].get_subscription_count())
+
+    def serve(self, name: str, action: Callable[[], str]) -> None:
+        """Offer the service ``~/name`` (std_srvs/Trigger); ``action`` runs in the callback and returns the answer."""
+
+        def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+            response.success, response.message = True, ""
+            try:
+                response.message = action()
+            except Exception as error:
+                response.success, response.message = False, str(error)
+            return response
+
+        self.create_service(Trigger, f"~/{name}", answer)
+
+    def enqueue(self, job: Callable[[], None]) -> None:
+        """Run a job in the worker, after all that waits there."""
+        self._worker.control(job)
+
+    def raise_session(self, reason: str, stamp_ns: int = 0) -> Session:
+        """Begin a new session here and tell all nodes."""
+        session = Session(self._newest_session + 1, reason, stamp_ns)
+        self.send(SESSION, session_to_message(session))
+        self._begin(session)
+        return session
+
+    def set_state(self, state: NodeState, hint: str = "") -> None:
+        """Change the state and say so at once."""
+        self.state, self._hint = state, hint
+        self.publish_status()
+
+    # Life
+
+    def start(self) -> None:
+        """Start the worker; the stage is made as soon as there is a calibration."""
+        self._worker.start()
+        if self.calibration is not None or not self._needs_calibration:
+            self._make_ready()
+
+    def close(self) -> bool:
+        """Stop the worker and destroy the node; return False where a job would not end."""
+        stopped = self._worker.stop(_STOP_S)
+        if stopped:
+            self.destroy_node()
+        return stopped
+
+    def publish_status(self) -> None:
+        """Publish ``status`` and ``/diagnostics``."""
+        status = self._status()
+        self.others[status.node] = status
+        message = status_to_message(status)
+        for topic in (STATUS, DIAGNOSTICS):
+            self.send(topic, message)
+
+    def _connect(self) -> None:
+        for topic in (STATUS, DIAGNOSTICS, SESSION):
+            self.advertise(topic)
+        self.create_subscription(Header, SESSION.name, self._on_session_message, quality(SESSION))
+        self.create_subscription(message_type(STATUS), STATUS.name, self._on_status, quality(STATUS))
+        self.create_subscription(String, CALIBRATION.name, self._on_calibration, quality(CALIBRATION))
+        self.create_timer(_STATUS_PERIOD_S, self.publish_status)
+        self.create_timer(_FINISH_PERIOD_S, self._check_finish)
+        self.serve("reset", lambda: f"session {self.raise_session(f'reset of {self.get_name()}').number}")
+        self.serve("pause", self._pause)
+        self.serve("resume", self._resume)
+
+    def _make_ready(self) -> None:
+        self.set_state(NodeState.WARMING)
+
+        def prepare() -> None:
+            self.create_stage(self.calibration)
+            self.on_session(Session(self.session, "start"))
+            self.set_state(NodeState.READY)
+
+        self.enqueue(prepare)
+
+    def _process(
+        self, entry: _Input, read: Callable[[Any], T], handle: Callable[[T], None], message: Any, arrived_s: float
+    ) -> None:
+        if self.state not in (NodeState.READY, NodeState.FINISHED):
+            self.counters.add(f"{entry.topic.name}_while_{self.state.value}")
+            return
+        try:
+            value = read(message)
+        except MessageError as error:
+            self.counters.add(f"{entry.topic.name}_malformed")
+            self.get_logger().warning(f"'{entry.name}': {error}", throttle_duration_sec=5.0)
+            return
+        if getattr(value, "session", self.session) != self.session:
+            self.counters.add(f"{entry.topic.name}_of_other_sessions")
+            return
+        handle(value)
+        self.latency.add(time.monotonic() - arrived_s)
+
+    def fail(self, error: Exception) -> None:
+        """A stage raised: the node ends, since what it would go on with is not known to be sound."""
+        if not rclpy.ok():
+            return
+        self.failure = f"{type(error).__name__}: {error}"
+        self.get_logger().error(f"{self.get_name()} failed: {self.failure}")
+        self.get_logger().debug(traceback.format_exc())
+        self.set_state(NodeState.FAILED, self.failure)
+        rclpy.try_shutdown()
+
+    # Calibration
+
+    def _load_calibration(self) -> Calibration:
+        config = self.node_config
+        imu = Path(config.imu_calibration_file) if config.imu_calibration_file else None
+        return load_calibration(Path(config.calibration_file), self.mode, imu)
+
+    def _on_calibration(self, message: String) -> None:
+        try:
+            calibration = parse_calibration(message.data, self.mode)
+        except CalibrationError as error:
+            self._calibration_hint = str(error)
+            self.get_logger().error(self._calibration_hint)
+            return
+        if self.calibration is None:
+            self.calibration = calibration
+            self._make_ready()
+        elif to_yaml(calibration.document) != to_yaml(self.calibration.document):
+            used = self.node_config.calibration_file or "the first one"
+            self._calibration_hint = f"the calibration on the topic differs from '{used}', which is used"
+            self.get_logger().warning(self._calibration_hint)
+
+    # Sessions
+
+    def _on_session_message(self, message: Header) -> None:
+        try:
+            session = session_from_message(message)
+        except MessageError as error:
+            self.counters.add("session_malformed")
+            self.get_logger().warning(str(error), throttle_duration_sec=5.0)
+            return
+        if session.number > self._newest_session:
+            self._begin(session)
+
+    def _begin(self, session: Session) -> None:
+        """Drop what waits, then let the stage start anew; data that come from now on are of the new session."""
+        self._newest_session = session.number
+        self.counters.add("dropped_by_session", self._worker.clear())
+        self._finished_sources.clear()
+        for entry in self._inputs.values():
+            entry.received = 0
+
+        def begin() -> None:
+            self.session, self._sent = session.number, Counters()
+            if self.parameters.changed and self.state is not NodeState.WAITING:
+                self.parameters.changed = False
+                self.create_stage(self.calibration)
+            if self.state in (NodeState.READY, NodeState.FINISHED, NodeState.PAUSED):
+                self.on_session(session)
+                self.state = NodeState.READY if self.state is NodeState.FINISHED else self.state
+            self.publish_status()
+
+        self.enqueue(begin)
+
+    # End of the input
+
+    def _on_status(self, message: Any) -> None:
+        try:
+            status = status_from_message(message)
+        except MessageError:
+            self.counters.add("status_malformed")
+            return
+        self.others[status.node] = status
+        if status.state is NodeState.FINISHED and status.values.get("session") == str(self.session):
+            self._finished_sources[status.node] = status.values
+
+    def _check_finish(self) -> None:
+        """Finish once every source has, and all that it sent has come and is worked off."""
+        inputs = [entry for entry in self._inputs.values() if entry.ends]
+        if self.state is not NodeState.READY or not inputs or not self._worker.is_idle:
+            return
+        if all(self._has_ended(entry) for entry in inputs):
+
+            def finish() -> None:
+                self.on_finish()
+                self.set_state(NodeState.FINISHED)
+
+            self.enqueue(finish)
+
+    def _has_ended(self, entry: _Input) -> bool:
+        (source,) = entry.topic.sources
+        values = self._finished_sources.get(source)
+        if values is None:
+            return False
+        sent = int(values.get(f"sent.{entry.topic.name}", "0"))
+        return entry.received >= sent or time.monotonic() - entry.last_s > _QUIET_S
+
+    # Services and status
+
+    def _pause(self) -> str:
+        def pause() -> None:
+            if self.state is NodeState.READY:
+                self.on_pause()
+                self.set_state(NodeState.PAUSED, "paused by service")
+
+        self.enqueue(pause)
+        return "pausing"
+
+    def _resume(self) -> str:
+        def resume() -> None:
+            if self.state is NodeState.PAUSED:
+                self.on_resume()
+                self.set_state(NodeState.READY)
+
+        self.enqueue(resume)
+        return "resuming"
+
+    def _status(self) -> StageStatus:
+        health, hint, values = self.stage_status()
+        dropped = self._worker.dropped.values
+        if dropped:
+            health = Health.WARN if health is Health.OK else health
+            hint = hint or f"too slow: {', '.join(f'{count} of {name}' for name, count in dropped.items())} dropped"
+        if self.state is NodeState.FAILED:
+            health = Health.ERROR
+        return StageStatus(
+            stamp_ns=time.time_ns(),
+            node=self.get_name(),
+            health=health,
+            state=self.state,
+            hint=self._hint or self._calibration_hint or hint,
+            values={"session": str(self.session), **values, **self._figures()},
+        )
+
+    def _figures(self) -> dict[str, str]:
+        figures = {
+            "unmatched": ",".join(
+                entry.name
+                for entry in self._inputs.values()
+                if entry.subscription and not entry.subscription.get_publisher_count()
+            )
+        }
+        for name, entry in self._inputs.items():
+            figures[f"rate_hz.{name}"] = f"{entry.rate.read_hz():.1f}"
+            figures[f"received.{name}"] = str(entry.received)
+            figures[f"waiting.{name}"] = str(self._worker.waiting(name))
+        percentiles = self.latency.percentiles_ms()
+        if percentiles:
+            figures["latency_p50_ms"], figures["latency_p99_ms"] = (f"{value:.2f}" for value in percentiles)
+        figures |= {f"sent.{name}": str(count) for name, count in self._sent.values.items()}
+        figures |= {f"dropped.{name}": str(count) for name, count in self._worker.dropped.values.items()}
+        for prefix, counters in (("node", self.counters), ("stage", self.stage_counters())):
+            figures |= {f"{prefix}.{name}": str(count) for name, count in list(counters.values.items())}
+        return figures

@@ -1,0 +1,38 @@
+"""Fast DDS profile and quality of service."""
+
+from __future__ import annotations
+
+import importlib
+import os
+from pathlib import Path
+from typing import Any
+
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+from vli_common.topics import Topic
+
+_PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
+LOCAL_PROFILE = Path(__file__).with_name("fastdds_local.xml")
+NETWORK_PROFILE = Path(__file__).with_name("fastdds_network.xml")
+
+
+def set_transport_profile(profile: Path = LOCAL_PROFILE) -> None:
+    """Let Fast DDS use ``profile`` unless the environment names one already; call before ``rclpy.init``."""
+    if not any(os.environ.get(name) for name in _PROFILE_VARIABLES):
+        os.environ[_PROFILE_VARIABLES[0]] = str(profile)
+
+
+def quality(topic: Topic) -> QoSProfile:
+    """Return the quality of service of a topic: always RELIABLE, as a best-effort publisher never reaches a reliable reader."""
+    return QoSProfile(
+        depth=topic.depth,
+        history=HistoryPolicy.KEEP_LAST,
+        reliability=ReliabilityPolicy.RELIABLE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if topic.transient_local else DurabilityPolicy.VOLATILE,
+    )
+
+
+def message_type(topic: Topic) -> Any:
+    """Return the message class of a topic."""
+    package, _, name = topic.type.split("/")
+    return getattr(importlib.import_module(f"{package}.msg"), name)

@@ -1,0 +1,1 @@
+"""The driver's nodes: sources, and demultiplexer with stripe detector."""

@@ -1,0 +1,146 @@
+"""Plays a bag as if it were the scanner: camera, IMU, calibration, session."""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+from pathlib import Path
+
+from std_msgs.msg import String
+
+from vli_common.calibration import Calibration, to_yaml
+from vli_common.errors import VliError
+from vli_common.messages import encoded_to_message, exposure_to_message, imu_to_message
+from vli_common.node import VliNode, run_node
+from vli_common.status import Health, NodeState
+from vli_common.topics import CALIBRATION, EXPOSURE, IMAGE_RAW, IMAGE_RAW_COMPRESSED, IMU
+from vli_common.types import Counters, EncodedImage, ImuSample
+from vli_driver.bag import BagReader, BagTopics
+from vli_driver.config import DriverConfig
+from vli_driver.player import BagPlayer, PlaybackConfig
+
+_POLL_S = 0.02
+_SETTLE_S = 0.3
+"""A writer may know its reader a moment later than the reader knows its writer."""
+
+
+class DriverNode(VliNode):
+    """Waits until the nodes of ``wait_for`` are ready and of the new session, then plays.
+
+    Raises:
+        InputError: the bag cannot be used.
+    """
+
+    def __init__(self) -> None:
+        super().__init__("driver_node", {DriverConfig: "", PlaybackConfig: ""}, needs_calibration=False)
+        self._playback = self.parameters.config(PlaybackConfig)
+        self._player = BagPlayer(self._playback.rate, self._publish_item, self._on_jump)
+        self._thread: threading.Thread | None = None
+        self._open_reader()
+        for topic in (CALIBRATION, IMAGE_RAW, IMAGE_RAW_COMPRESSED, EXPOSURE, IMU):
+            self.advertise(topic)
+
+    def create_stage(self, calibration: Calibration | None) -> None:
+        """Publish the calibration and start to play."""
+        if calibration is not None:
+            self.send(CALIBRATION, String(data=to_yaml(calibration.document)))
+        if self._playback.bag and self._thread is None:
+            self._thread = threading.Thread(target=self._play, name="player", daemon=True)
+            self._thread.start()
+
+    def on_pause(self) -> None:
+        """Hold the playback."""
+        self._player.pause()
+
+    def on_resume(self) -> None:
+        """Go on with the playback."""
+        self._player.resume()
+
+    def stage_counters(self) -> Counters:
+        """Return the counters of the playback."""
+        return self._player.counters
+
+    def stage_status(self) -> tuple[Health, str, dict[str, str]]:
+        """Return the position in the bag."""
+        late = self._player.counters["late"]
+        hint = f"{late} items were late: the machine does not keep the pace of the bag" if late else ""
+        return Health.WARN if late else Health.OK, hint, {"position_ns": str(self._player.position_ns)}
+
+    def close(self) -> bool:
+        """Stop the playback, then the node."""
+        self._player.stop()
+        if self._thread is not None:
+            self._thread.join(1.0)
+        return super().close()
+
+    def _open_reader(self) -> BagReader | None:
+        if not self._playback.bag:
+            return None
+        config, playback = self.parameters.config(DriverConfig), self._playback
+        topics = BagTopics(
+            config.image_topic, config.imu_topic, config.camera_info_topic, config.exposure_topic, self.mode.uses_imu
+        )
+        return BagReader(Path(playback.bag), topics, playback.start, playback.duration or None)
+
+    def _play(self) -> None:
+        try:
+            self._play_all()
+        except VliError as error:
+            self.fail(error)
+
+    def _play_all(self) -> None:
+        """Play once, or for ever; each time is a session of its own."""
+        again = True
+        while again:
+            reader = self._open_reader()
+            if reader is None:
+                return
+            self._begin_session(f"bag '{reader.path.name}'", 0)
+            if not self._player.play(reader):
+                return
+            for warning in reader.warnings:
+                self.get_logger().warning(warning)
+            again = self._playback.loop
+        self.set_state(NodeState.FINISHED)
+
+    def _on_jump(self, reason: str, stamp_ns: int) -> None:
+        self._begin_session(reason, stamp_ns)
+
+    def _begin_session(self, reason: str, stamp_ns: int) -> None:
+        """Raise a session and wait until all have followed."""
+        number = self.raise_session(reason, stamp_ns).number
+        names = [self.get_name(), *(name.strip() for name in self._playback.wait_for.split(",") if name.strip())]
+        deadline_s = time.monotonic() + self._playback.wait_timeout
+        while missing := [name for name in names if not self._has_followed(name, number)]:
+            if time.monotonic() > deadline_s:
+                self.get_logger().warning(f"playing without {', '.join(missing)}: not ready in {self._playback.wait_timeout:g} s")
+                break
+            time.sleep(_POLL_S)
+        time.sleep(_SETTLE_S)
+
+    def _has_followed(self, name: str, session: int) -> bool:
+        status = self.others.get(name)
+        return (
+            status is not None
+            and status.state is NodeState.READY
+            and status.values.get("session") == str(session)
+            and not status.values.get("unmatched")
+        )
+
+    def _publish_item(self, item: EncodedImage | ImuSample) -> None:
+        if isinstance(item, ImuSample):
+            self.send(IMU, imu_to_message(item))
+            return
+        if item.laser_on is not None or item.exposure_s is not None:
+            self.send(EXPOSURE, exposure_to_message(item))
+        self.send(IMAGE_RAW_COMPRESSED if item.compressed else IMAGE_RAW, encoded_to_message(item))
+
+
+def main() -> None:
+    """Run the node."""
+    sys.exit(run_node(DriverNode))
+
+
+if __name__ == "__main__":
+    main()
