@@ -73,6 +73,7 @@ class Pipeline:
         self.session = 0
         self._mode = mode
         self._clock = ClockMonitor()
+        self._image_shape: tuple[int, ...] | None = None
 
     def push(self, item: EncodedImage | ImuSample) -> list[Event]:
         """Take the next item of the source; return what it completed."""
@@ -111,6 +112,10 @@ class Pipeline:
                 image = replace(decode(encoded), session=self.session)
         except InputError:
             self.counters.add("undecodable_images")
+            return
+        self._image_shape = self._image_shape or image.pixels.shape
+        if image.pixels.shape != self._image_shape:
+            self.counters.add("images_of_another_shape")
             return
         with self.timer.measure_unsorted("demux", encoded.stamp_ns):
             ready = self.stages.demultiplexer.push(image)
