@@ -12,11 +12,12 @@ import numba
 import numpy as np
 
 from vli_common.arrays import BoolArray, ByteArray, Float32Array
+from vli_simulation.texture import FAST
 
 NOTHING = 255
 """Material where a ray hits nothing."""
 _SAME_SURFACE = 1.5e-3
-_SAME_NORMAL = 0.975
+_SAME_NORMAL = 0.95
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ class GBuffer:
         )
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
 def resolve(
     origin, directions, distance, u, v, triangle, faces, vertex_normals, material_of, tile_of, vertex_uv, depth, points, normals, material, tile, uv
 ):
@@ -96,7 +97,7 @@ def resolve(
                 uv[n, axis] = w * vertex_uv[a, axis] + u[n] * vertex_uv[b, axis] + v[n] * vertex_uv[c, axis]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
 def _continues(d, depth, normals, material, p, q):
     """Return whether corner q lies on the plane through corner p, with nearly the same normal."""
     if material[p] != material[q] or depth[p] <= 0.0 or depth[q] <= 0.0:
@@ -109,7 +110,7 @@ def _continues(d, depth, normals, material, p, q):
     return abs(at_p * depth[p] - at_q * depth[q]) < _SAME_SURFACE * depth[p] * abs(at_q)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
 def enlarge(
     origin, coarse_directions, c_depth, c_normals, c_material, c_tile, c_uv, c_lit, directions, height, width,
     depth, points, normals, material, tile, uv, lit, rough,
@@ -160,7 +161,7 @@ def enlarge(
                             uv[n, axis] = wp * c_uv[p, axis] + wq * c_uv[q, axis] + wr * c_uv[r, axis] + ws * c_uv[s, axis]
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
 def turn(rotation, rays, out):
     """Fill ``out`` with rays (N, 3) turned by a rotation (3, 3); BLAS would wake its threads for this."""
     for n in range(len(rays)):

@@ -21,8 +21,8 @@ from vli_simulation.texture import noise_table
 _GREY_OF_WHITE = 330.0
 """Grey level of a white surface that faces the light at the nominal distance, in the nominal long exposure."""
 _NOMINAL_LONG_S, _NOMINAL_SHORT_S = 0.005, 0.0004
-_STRIPE_OF_WHITE = 620.0
-"""Grey level in the middle of the stripe on white, nominal short exposure: two and a half times saturation."""
+_STRIPE_OF_WHITE = 900.0
+"""Grey level in the middle of the stripe on white, nominal short exposure: white saturates three and a half times."""
 _WAIST, _DIVERGENCE = 0.8e-4, 1.4e-3
 _FAN_RAYS = 1600
 _VISIBLE_GREY = 12.0
@@ -84,11 +84,8 @@ class Renderer:
         radiance, depth = self._dim_view(view)
         exposure = self._config.sensor.exposure_short_s
         image = self._lens.expose(radiance, depth, view.velocity, view.rate, exposure, _GREY_OF_WHITE * exposure / _NOMINAL_LONG_S)
-        stripe = self._stripe(view)
-        still = np.zeros(3)
-        # The stripe travels with the camera: it is not smeared as the surface is.
-        laser = stripe[..., None] * self._rig.laser.response.astype(np.float32)
-        image += self._lens.expose(laser, depth, still, still, exposure, _STRIPE_OF_WHITE * exposure / _NOMINAL_SHORT_S) * self._speckle(rng)
+        gain = _STRIPE_OF_WHITE * exposure / _NOMINAL_SHORT_S
+        self._lens.add_laser(self._stripe(view) * self._speckle(rng), self._rig.laser.response, gain, image)
         return image
 
     def seen(self, view: View) -> SeenPoints:
@@ -124,11 +121,11 @@ class Renderer:
         return radiance.reshape(lens.height, lens.width, 3), full.depth.reshape(lens.height, lens.width)
 
     def _dim_view(self, view: View) -> tuple[Float32Array, Float32Array]:
-        """Return the view at half the resolution, enlarged: a short exposure hardly shows it above the noise."""
+        """Return the view at a third of the resolution, enlarged: a short exposure hardly shows it above the noise."""
         lens = self._lens
-        buffer = self._look(view, lens.coarse_rays)
-        radiance = lens.enlarge(self._light(view, buffer)[1].reshape(*lens.coarse_shape, 3))
-        return radiance, lens.enlarge(buffer.depth.reshape(lens.coarse_shape))
+        buffer = self._look(view, lens.dim_rays)
+        radiance = lens.enlarge(self._light(view, buffer)[1].reshape(*lens.dim_shape, 3))
+        return radiance, lens.enlarge(buffer.depth.reshape(lens.dim_shape))
 
     def _stripe(self, view: View) -> Float32Array:
         """Return the light of the laser on the surface (H, W), 1 on white at the nominal distance."""

@@ -6,13 +6,13 @@ import numba
 import numpy as np
 
 from vli_simulation.gbuffer import NOTHING
-from vli_simulation.texture import fractal_noise, sample_tile, speck
+from vli_simulation.texture import FAST, fractal_noise, sample_tile, speck
 
 AMBIENT = 0.05
 """Light that reaches every surface by reflection, as a share of direct light at the nominal distance."""
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
 def surface_albedo(points, depth, material, tile, uv, focal_px, materials, tiles, table, albedo):
     """Fill ``albedo`` (N, 3), order blue, green, red, with detail down to the size of a pixel on the surface, depth / focal."""
     for n in range(len(points)):
@@ -22,7 +22,7 @@ def surface_albedo(points, depth, material, tile, uv, focal_px, materials, tiles
         m = materials[material[n]]
         x, y, z = np.float64(points[n, 0]), np.float64(points[n, 1]), np.float64(points[n, 2])
         size = max(depth[n] / focal_px, 1e-6)
-        stain = fractal_noise(table, x + 0.31, y, z, m[9], 1, 0.6, size)
+        stain = fractal_noise(table, 0.6 * x + 0.8 * y + 0.31, 0.6 * y - 0.8 * x, z, m[9], 2, 0.7, size)
         mixed = min(max((stain - 1.2 + 2.0 * m[10]) * 0.8 + 0.1, 0.0), 1.0)
         gain = max(1.0 + m[12] * fractal_noise(table, x / m[14], y, z, m[11], 2, m[13], size), 0.15)
         if m[16] > 0.0:
@@ -34,11 +34,11 @@ def surface_albedo(points, depth, material, tile, uv, focal_px, materials, tiles
             albedo[n, channel] = max(base + ink * (m[6 + k] * (0.6 + 0.4 * gain) - base), 0.0)
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
 def illuminate(points, normals, material, lit, materials, eye, light, light_axis, nominal, albedo, radiance):
     """Fill ``radiance`` (N, 3): 1 is a white surface that faces the light at ``nominal`` metres.
 
-    Inverse-square and cosine fall-off, the LED's own cosine lobe about ``light_axis``, a Blinn–Phong highlight, and ambient light.
+    Inverse-square and cosine fall-off, the LED's own cosine lobe about ``light_axis``, a Blinn highlight, and ambient light.
     """
     for n in range(len(points)):
         if material[n] == NOTHING:
@@ -59,12 +59,13 @@ def illuminate(points, normals, material, lit, materials, eye, light, light_axis
             diffuse += strength * cosine
             hx, hy, hz = lx * r + ex * e, ly * r + ey * e, lz * r + ez * e
             half = (normals[n, 0] * hx + normals[n, 1] * hy + normals[n, 2] * hz) / np.sqrt(hx * hx + hy * hy + hz * hz)
-            highlight = m[18] * strength * max(half, 0.0) ** m[19]
+            # Schlick's rational stand-in for half ** shininess: a power costs as much as all the rest.
+            highlight = m[18] * strength * half / (m[19] - m[19] * half + half) if half > 0.0 else 0.0
         for channel in range(3):
             radiance[n, channel] = albedo[n, channel] * diffuse + highlight * (0.4 + 0.6 * albedo[n, channel])
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, fastmath=FAST)
 def sheet_irradiance(points, normals, material, origin, plane, waist, divergence, nominal, out):
     """Fill ``out`` (N,): 1 where a surface that faces the laser at ``nominal`` metres is cut by the middle of the sheet.
 

@@ -6,9 +6,11 @@ from collections.abc import Callable
 
 from vli_simulation.config import SimulationError
 from vli_simulation.scenes.keyboard import make_keyboard
+from vli_simulation.scenes.part import make_part
+from vli_simulation.scenes.pipe import make_pipe
 from vli_simulation.scenes.scene import Scene
 
-SCENES: dict[str, Callable[[int], Scene]] = {"keyboard": make_keyboard}
+SCENES: dict[str, Callable[[int], Scene]] = {"keyboard": make_keyboard, "pipe": make_pipe, "part": make_part}
 """Scene name → function that makes it from a seed."""
 
 

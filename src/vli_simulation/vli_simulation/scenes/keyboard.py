@@ -55,7 +55,7 @@ def make_keyboard(seed: int) -> Scene:
 
 
 def _materials(rng: np.random.Generator) -> tuple[Material, ...]:
-    light, dark, accent = (0.60, 0.57, 0.50), (0.21, 0.23, 0.26), (0.62, 0.26, 0.10)
+    light, dark, accent = (0.60, 0.57, 0.50), (0.25, 0.28, 0.32), (0.62, 0.26, 0.10)
     worn = {"stain_cell": 0.005, "stain": 0.35, "grain": 0.085}
     caps = [Material(jitter(light, rng), jitter((0.50, 0.45, 0.36), rng), **worn) for _ in range(5)]
     modifiers = [Material(jitter(dark, rng), jitter((0.30, 0.30, 0.30), rng), ink=(0.62, 0.62, 0.60), **worn) for _ in range(4)]
