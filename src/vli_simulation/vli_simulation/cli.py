@@ -59,9 +59,10 @@ def run(args: argparse.Namespace) -> int:
         SimulationError, ConfigError: what was asked for is impossible.
     """
     config = make_config(args.preset, _overrides(args))
-    partial = _prepare(args.out, args.overwrite)
+    _refuse_to_overwrite(args.out, args.overwrite)
     start = time.monotonic()
     simulation = Simulation(args.scene, config, args.seed)
+    partial = _make_partial(args.out)
     with tqdm(total=len(simulation), unit="frame", disable=None, file=sys.stderr) as bar:
         write_recording(simulation, partial, args.workers, bar.update)
     if args.out.exists():
@@ -88,10 +89,13 @@ def _overrides(args: argparse.Namespace) -> dict[str, Any]:
     return given
 
 
-def _prepare(out: Path, overwrite: bool) -> Path:
-    """Return the empty directory ``OUT.partial``; what was left there by an interrupted run is removed."""
+def _refuse_to_overwrite(out: Path, overwrite: bool) -> None:
     if out.exists() and (not out.is_dir() or any(out.iterdir())) and not overwrite:
         raise OutputError(f"'{out}' exists and is not empty; choose another --out or add --overwrite")
+
+
+def _make_partial(out: Path) -> Path:
+    """Return the empty directory ``OUT.partial``; what was left there by an interrupted run is removed."""
     partial = out.with_name(out.name + ".partial")
     if partial.exists():
         shutil.rmtree(partial)

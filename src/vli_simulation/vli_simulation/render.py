@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from vli_common.arrays import Float32Array, FloatArray, IntArray
+from vli_common.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from vli_common.geometry import inverse, transform
 from vli_simulation import gbuffer, shading
 from vli_simulation.caster import RayCaster
 from vli_simulation.config import SimulationConfig
-from vli_simulation.gbuffer import NOTHING, GBuffer
+from vli_simulation.gbuffer import GBuffer
 from vli_simulation.optics import SUBPIXELS, Lens
 from vli_simulation.rig import Rig
 from vli_simulation.scenes.scene import Scene
@@ -104,6 +104,18 @@ class Renderer:
     def _full_view(self, view: View) -> tuple[Float32Array, Float32Array]:
         """Return (radiance (H, W, 3), depth (H, W)), several rays a pixel where the surface is not smooth."""
         lens = self._lens
+        full, rough = self._interpolated(view)
+        radiance = self._light(view, full)[1]
+        where = np.flatnonzero(rough)
+        if len(where):
+            samples = self._look(view, lens.subrays[:, where].reshape(-1, 3))
+            radiance[where] = self._light(view, samples)[1].reshape(len(SUBPIXELS), len(where), 3).mean(axis=0)
+            full.depth[where] = samples.depth.reshape(len(SUBPIXELS), len(where)).max(axis=0)
+        return radiance.reshape(lens.height, lens.width, 3), full.depth.reshape(lens.height, lens.width)
+
+    def _interpolated(self, view: View) -> tuple[GBuffer, BoolArray]:
+        """Return all pixels from rays through every second one, and (H·W,) where that is not enough."""
+        lens = self._lens
         coarse = self._look(view, lens.coarse_rays)
         full = GBuffer.empty(lens.height * lens.width)
         rough = np.empty(len(full), np.bool_)
@@ -112,13 +124,7 @@ class Renderer:
             self._turn(view, lens.rays), lens.height, lens.width,
             full.depth, full.points, full.normals, full.material, full.tile, full.uv, full.lit, rough,
         )  # fmt: skip
-        radiance = self._light(view, full)[1]
-        where = np.flatnonzero(rough)
-        if len(where):
-            samples = self._look(view, lens.subrays[:, where].reshape(-1, 3))
-            radiance[where] = self._light(view, samples)[1].reshape(len(SUBPIXELS), len(where), 3).mean(axis=0)
-            full.depth[where] = samples.depth.reshape(len(SUBPIXELS), len(where)).max(axis=0)
-        return radiance.reshape(lens.height, lens.width, 3), full.depth.reshape(lens.height, lens.width)
+        return full, rough
 
     def _dim_view(self, view: View) -> tuple[Float32Array, Float32Array]:
         """Return the view at a third of the resolution, enlarged: a short exposure hardly shows it above the noise."""
