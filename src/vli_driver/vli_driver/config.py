@@ -62,13 +62,13 @@ class StripeConfig:
     )
     min_peak: float = parameter(10.0, unit="grey levels", minimum=1.0, maximum=200.0, doc="smoothed peak above the background")
     max_width_px: float = parameter(
-        20.0, unit="px", minimum=2.0, maximum=100.0, doc="width at half height beyond which a peak is no laser line"
+        12.0, unit="px", minimum=2.0, maximum=100.0, doc="width at half height beyond which a peak is no laser line"
     )
     min_colour_ratio: float = parameter(
         1.3, minimum=0.0, maximum=10.0, doc="light in the laser's channel over that in the others, in colour images; 0 for a white line"
     )
-    max_lean_px: float = parameter(
-        0.12, unit="px", minimum=0.02, maximum=10.0, doc="asymmetry beyond which an edge is taken to cut the line; lower: fewer wrong points at edges"
+    max_lean: float = parameter(
+        0.03, minimum=0.005, maximum=1.0, doc="asymmetry, share of the width, beyond which an edge cuts the line; lower: fewer wrong points at edges"
     )
     ambiguity: float = parameter(
         0.6, minimum=0.1, maximum=1.0, doc="a second peak of this share of the first makes a column ambiguous unless its neighbours decide"

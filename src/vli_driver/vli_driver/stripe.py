@@ -80,7 +80,9 @@ class CentreOfMassDetector:
         channel = self._channel(profiles)
         noise = kernels.noise_level(profiles, channel)
         threshold = max(config.min_peak, config.min_snr * self._noise_gain * noise)
-        found = kernels.find_peaks(self._smoothed(profiles, channel), self._first, self._last, threshold, config.ambiguity)
+        found = kernels.find_peaks(
+            self._smoothed(profiles, channel), self._first, self._last, threshold, config.ambiguity, config.max_width_px
+        )
         peaks, ambiguous = kernels.choose_chain(found, config.max_jump_px)
         located = kernels.locate(
             profiles, channel, peaks, config.smoothing_px, noise, threshold, config.window_sigmas, config.max_width_px
@@ -88,7 +90,7 @@ class CentreOfMassDetector:
         ratio = config.min_colour_ratio if profiles.shape[2] > 1 else 0.0
         keep = kernels.keep_segments(located, ambiguous, config.max_jump_px, config.min_segment_points, ratio)
         lean = kernels.steady_lean(located, keep)
-        keep &= np.abs(lean) <= config.max_lean_px
+        keep &= np.abs(lean) <= config.max_lean
         kernels.trim_segments(located, keep, config.max_jump_px, config.trim_points, config.min_segment_points)
         return self._points(located, lean, np.flatnonzero(keep))
 
@@ -123,11 +125,11 @@ class CentreOfMassDetector:
         if len(rows) < self.config.min_points:
             self.counters.add("no_stripe")
             return StripePoints(np.empty((0, 2)), np.empty(0), np.empty(0))
-        centre, peak, total, sensor, speckled = located[rows, :5].T
+        centre, peak, total, sensor, speckled, _, _, width = located[rows].T
         across = centre + self._start
         pixels = np.stack([rows, across] if self.band.along_columns else [across, rows], axis=1).astype(np.float64)
         speckle = speckle_contrast(total, speckled)
-        bias = _LEAN_BIAS * lean[rows]
+        bias = _LEAN_BIAS * lean[rows] * width
         sigma_px = np.sqrt((sensor + speckle**2 * speckled) / total**2 + bias**2 + self.config.sigma_floor_px**2)
         return StripePoints(pixels, peak, sigma_px)
 

@@ -22,6 +22,7 @@ _FWHM = 2.3548
 _SHOT_GAIN = 0.1
 """Variance per grey level of signal: some ten electrons to a grey level, as small 8-bit sensors have."""
 _UNEVEN = 0.15
+_TOP = 0.85
 _LEAN_REACH = 4
 _MAX_MISSING = 2
 """Missing points that do not end a segment."""
@@ -151,7 +152,15 @@ def _background(line):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def find_peaks(smoothed, first, last, threshold, ambiguity):  # type: ignore[no-untyped-def]
+def _ground(line, peak, background):  # type: ignore[no-untyped-def]
+    """Return the level of the bright surface that a peak stands on, found beside its top."""
+    low, high = _extent(line, peak, background + _TOP * (line[peak] - background))
+    apart = int(max(high - low, _ANNULUS))
+    return max(line[max(int(low) - apart, 0)], line[min(int(high) + apart, len(line) - 1)], background)
+
+
+@njit(cache=True)
+def find_peaks(smoothed, first, last, threshold, ambiguity, max_width):  # type: ignore[no-untyped-def]
     """Find the highest peak of each smoothed profile, and a second one apart from it.
 
     Args:
@@ -159,6 +168,7 @@ def find_peaks(smoothed, first, last, threshold, ambiguity):  # type: ignore[no-
         first, last: (N,) int64, peaks are sought in [first, last).
         threshold: least height above the profile's background, grey levels.
         ambiguity: least height of the second peak, as a share of the first.
+        max_width: pixels, peaks that seem wider are measured above the surface that they stand on.
 
     Returns:
         (N, 2, 4) float64: low and high end of the peak at half height, the height, the middle of the ends at a quarter of it; height
@@ -174,9 +184,15 @@ def find_peaks(smoothed, first, last, threshold, ambiguity):  # type: ignore[no-
         for k in range(CANDIDATES):
             if peak < 0:
                 break
-            height = line[peak] - background
-            low, high = _extent(line, peak, background + 0.5 * height)
-            foot = _extent(line, peak, background + 0.25 * height)
+            base = background
+            low, high = _extent(line, peak, 0.5 * (line[peak] + base))
+            if high - low > max_width:
+                base = _ground(line, peak, background)
+                if line[peak] - base < threshold * SCALE:
+                    break
+                low, high = _extent(line, peak, 0.5 * (line[peak] + base))
+            height = line[peak] - base
+            foot = _extent(line, peak, base + 0.25 * height)
             found[i, k, 0], found[i, k, 1], found[i, k, 2], found[i, k, 3] = low, high, height / SCALE, 0.5 * (foot[0] + foot[1])
             if k + 1 < CANDIDATES:
                 peak = _second(line, begin, end, low, high, background + max(threshold * SCALE, ambiguity * height))
@@ -266,10 +282,10 @@ def locate(profiles, channel, peaks, smoothing, noise, threshold, window_sigmas,
         max_width: pixels, wider peaks are no laser line.
 
     Returns:
-        (N, 7) float64: centre, peak I, Σ I, Σ k² var(I_k) of sensor noise, Σ k² I_k² for speckle (k from the centre), Σ I of the other
-        channels' mean, lean (centre less the middle at a quarter of the height); NaN where there is no line.
+        (N, 8) float64: centre, peak I, Σ I, Σ k² var(I_k) of sensor noise, Σ k² I_k² for speckle (k from the centre), Σ I of the other
+        channels' mean, lean (centre less the middle at a quarter of the height, as a share of the width), width; NaN where there is no line.
     """
-    out = np.full((len(peaks), 7), np.nan)
+    out = np.full((len(peaks), 8), np.nan)
     for i in range(len(peaks)):
         low, high, height, foot = peaks[i]
         width = np.sqrt(max((high - low) ** 2 - (_FWHM * smoothing) ** 2, 1.0))
@@ -297,7 +313,8 @@ def locate(profiles, channel, peaks, smoothing, noise, threshold, window_sigmas,
             continue
         out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4] = centre, top, total, sensor, speckle
         out[i, 5] = _other_channels(profiles, i, channel, centre, half, reach)
-        out[i, 6] = centre - foot
+        out[i, 6] = (centre - foot) / (high - low)
+        out[i, 7] = width
     return out
 
 
@@ -395,7 +412,10 @@ def trim_segments(located, keep, max_jump, trim, min_points):  # type: ignore[no
 
 @njit(cache=True)
 def steady_lean(located, keep):  # type: ignore[no-untyped-def]
-    """Return (N,) the median lean of each kept point and its neighbours: speckle averages out, a line that an edge cuts leans on."""
+    """Return (N,) the median lean of each kept point and its neighbours: speckle averages out, a line that an edge cuts leans on.
+
+    The median of the whole frame is taken off: what the optics do to every line is part of the calibrated plane.
+    """
     count = len(located)
     lean = np.zeros(count)
     near = np.empty(2 * _LEAN_REACH + 1)
@@ -408,4 +428,6 @@ def steady_lean(located, keep):  # type: ignore[no-untyped-def]
                 near[number] = located[j, 6]
                 number += 1
         lean[i] = _median(near, number)
+    if keep.any():
+        lean -= np.median(lean[keep])
     return lean
