@@ -18,6 +18,7 @@ setup(
     ],
     install_requires=[
         "gtsam>=4.3",
+        "numba>=0.59",
         "numpy>=1.26",
         "plyfile>=1.0",
         "PyYAML>=6.0",

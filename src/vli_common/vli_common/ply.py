@@ -61,7 +61,7 @@ def read_cloud(path: Path) -> PointCloud:
         points=_get(vertex, ("x", "y", "z"), np.float32),
         colours=colours,
         normals=_get(vertex, _NORMAL, np.float32) if has_normals else None,
-        weights=np.asarray(vertex["weight"], np.float32) if "weight" in names else None,
+        weights=np.array(vertex["weight"], np.float32) if "weight" in names else None,
     )
 
 
@@ -116,8 +116,8 @@ def _write(path: Path, elements: list[PlyElement]) -> None:
 
 def _read(path: Path) -> PlyData:
     try:
-        # A mapped file would let go of its numbers with the file.
-        return PlyData.read(str(path), mmap=False, known_list_len={"face": {"vertex_indices": 3}})
+        # Mapped, which takes a known length of the lists: otherwise plyfile reads number by number, seconds for a map.
+        return PlyData.read(str(path), mmap=True, known_list_len={"face": {"vertex_indices": 3}})
     except PlyParseError:
         pass
     except OSError as error:
@@ -125,7 +125,7 @@ def _read(path: Path) -> PlyData:
     except (ValueError, UnicodeDecodeError, MemoryError) as error:
         raise InputError(f"'{path}' is no PLY file: {error}") from error
     try:
-        return PlyData.read(str(path), mmap=False)
+        return PlyData.read(str(path))
     except (PlyParseError, ValueError, UnicodeDecodeError, MemoryError) as error:
         raise InputError(f"'{path}' is no PLY file: {error}") from error
 

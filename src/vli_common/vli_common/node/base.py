@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 import traceback
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -21,7 +22,7 @@ from std_msgs.msg import Header, String
 from std_srvs.srv import Trigger
 
 from vli_common.calibration import Calibration, load_calibration, parse_calibration, to_yaml
-from vli_common.errors import CalibrationError, MessageError
+from vli_common.errors import CalibrationError, MessageError, VliError
 from vli_common.messages import Session, session_from_message, session_to_message, status_from_message, status_to_message
 from vli_common.node.parameters import NodeConfig, NodeParameters
 from vli_common.node.transport import message_type, quality
@@ -39,6 +40,7 @@ _QUIET_S = 1.0
 _QUEUE_DEPTHS = 6
 """The worker's queue holds this many times the depth of the topic."""
 _STOP_S = 2.0
+_CALL_S = 10.0
 
 
 @dataclass
@@ -190,6 +192,35 @@ class VliNode(Node):
     def enqueue(self, job: Callable[[], None]) -> None:
         """Run a job in the worker, after all that waits there."""
         self._worker.control(job)
+
+    def call(self, job: Callable[[], T]) -> T:
+        """Run a job in the worker, after all that waits there, and return its result; for services.
+
+        Raises:
+            TimeoutError: the worker did not come to it in 10 s.
+            Exception: what the job raised.
+        """
+        future: Future[T] = Future()
+
+        def run() -> None:
+            try:
+                future.set_result(job())
+            except Exception as error:
+                future.set_exception(error)
+
+        self.enqueue(run)
+        return future.result(_CALL_S)
+
+    @staticmethod
+    def existing(stage: T | None) -> T:
+        """Return a stage object, which is made before anything is handled.
+
+        Raises:
+            VliError: it is not there yet.
+        """
+        if stage is None:
+            raise VliError("the node is not ready: no calibration yet")
+        return stage
 
     def raise_session(self, reason: str, stamp_ns: int = 0) -> Session:
         """Begin a new session here and tell all nodes."""
@@ -400,14 +431,16 @@ class VliNode(Node):
             values={"session": str(self.session), **values, **self._figures()},
         )
 
+    def _unmatched(self) -> list[str]:
+        """Return the inputs that the node needs and nobody publishes."""
+        return [
+            entry.name
+            for entry in self._inputs.values()
+            if entry.required and entry.subscription is not None and not entry.subscription.get_publisher_count()
+        ]
+
     def _figures(self) -> dict[str, str]:
-        figures = {
-            "unmatched": ",".join(
-                entry.name
-                for entry in self._inputs.values()
-                if entry.subscription and not entry.subscription.get_publisher_count()
-            )
-        }
+        figures = {"unmatched": ",".join(self._unmatched()), "cpu_s": f"{time.process_time():.2f}"}
         for name, entry in self._inputs.items():
             figures[f"rate_hz.{name}"] = f"{entry.rate.read_hz():.1f}"
             figures[f"received.{name}"] = str(entry.received)

@@ -46,7 +46,7 @@ class DemuxNode(VliNode):
         self._demultiplexer = Demultiplexer(self.parameters.config(DemuxConfig))
         self._scanner: StripeScanner | None = None
         self._joiner: ExposureJoiner | None = None
-        self._clock = ClockMonitor()
+        self._jumps = ClockMonitor()
         for topic in (IMAGE_LONG, IMAGE_SHORT, LASER_POINTS):
             self.advertise(topic)
         names = self.parameters.config(InputTopics)
@@ -66,7 +66,7 @@ class DemuxNode(VliNode):
         """Begin a stream."""
         self._demultiplexer.reset()
         self._joiner = None
-        self._clock = ClockMonitor()
+        self._jumps = ClockMonitor()
 
     def on_pause(self) -> None:
         """Hand on what waits for a verdict."""
@@ -93,7 +93,7 @@ class DemuxNode(VliNode):
     def _on_image(self, item: Any) -> None:
         if not isinstance(item, EncodedImage):
             return
-        if jump := self._clock.jump("camera", item.stamp_ns):
+        if jump := self._jumps.jump("camera", item.stamp_ns):
             self.raise_session(jump, item.stamp_ns)
             self.enqueue(lambda: self._sort(item))
             return

@@ -1,0 +1,96 @@
+"""Long images, IMU and laser points in; tracks and preintegration out."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+
+from vli_common.calibration import Calibration
+from vli_common.config import parameter
+from vli_common.messages import (
+    Session,
+    bias_from_message,
+    image_from_message,
+    imu_from_message,
+    no_preintegration_message,
+    preintegration_to_message,
+    scan_from_message,
+    tracks_to_message,
+)
+from vli_common.node import VliNode, run_node
+from vli_common.topics import BIAS, IMAGE_LONG, IMU, LASER_POINTS, PREINTEGRATION, TRACKS
+from vli_common.types import Counters, FrontEndOutput, Image, ImuBias, ImuSample, LaserScan
+from vli_frontend.config import FrontEndConfig
+from vli_frontend.frontend import FrontEnd
+from vli_frontend.warm_up import warm_up
+
+
+@dataclass(frozen=True)
+class InputTopics:
+    """Where the IMU is."""
+
+    imu_topic: str = parameter(IMU.name, doc="sensor_msgs/Imu, angular rate in rad/s, specific force in m/s²")
+
+
+class FrontEndNode(VliNode):
+    """Tracks, keyframes, preintegration."""
+
+    def __init__(self) -> None:
+        super().__init__("frontend_node", {FrontEndConfig: "", InputTopics: ""})
+        self._front_end: FrontEnd | None = None
+        for topic in (TRACKS, PREINTEGRATION):
+            self.advertise(topic)
+        uses_imu = self.mode.uses_imu
+        self.receive(IMU, imu_from_message, self._on_imu, self.parameters.config(InputTopics).imu_topic, uses_imu, uses_imu)
+        self.receive(LASER_POINTS, scan_from_message, self._on_scan)
+        self.receive(IMAGE_LONG, lambda message: image_from_message(message, self.session), self._on_image)
+        self.receive(BIAS, lambda message: bias_from_message(message, self.session), self._on_bias, ends=False)
+
+    def create_stage(self, calibration: Calibration | None) -> None:
+        """Make the front end."""
+        if calibration is not None:
+            warm_up()
+            self._front_end = FrontEnd(calibration, self.parameters.config(FrontEndConfig), self.mode)
+
+    def on_session(self, session: Session) -> None:
+        """Begin a session."""
+        self.front_end.reset(session.number)
+
+    def stage_counters(self) -> Counters:
+        """Return the counters of the front end."""
+        return self._front_end.counters if self._front_end else Counters()
+
+    @property
+    def front_end(self) -> FrontEnd:
+        """The front end, which is there once the node is ready."""
+        return self.existing(self._front_end)
+
+    def _on_imu(self, sample: ImuSample) -> None:
+        self._emit(self.front_end.add_imu(sample))
+
+    def _on_image(self, image: Image) -> None:
+        self._emit(self.front_end.add_image(image))
+
+    def _on_scan(self, scan: LaserScan) -> None:
+        self.front_end.add_scan(scan)
+
+    def _on_bias(self, bias: ImuBias) -> None:
+        self.front_end.set_bias(bias)
+
+    def _emit(self, frames: list[FrontEndOutput]) -> None:
+        for frame in frames:
+            tracks, inertial = frame.tracks, frame.preintegration
+            message = (
+                preintegration_to_message(inertial) if inertial else no_preintegration_message(tracks.stamp_ns, tracks.session)
+            )
+            self.send(PREINTEGRATION, message)
+            self.send(TRACKS, tracks_to_message(tracks))
+
+
+def main() -> None:
+    """Run the node."""
+    sys.exit(run_node(FrontEndNode))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""The mapping stage as a node."""

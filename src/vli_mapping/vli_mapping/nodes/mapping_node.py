@@ -1,0 +1,126 @@
+"""Windows, laser points and long images in; the map, and constraints on the window, out."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from vli_common.calibration import Calibration
+from vli_common.config import parameter
+from vli_common.errors import OutputError
+from vli_common.messages import (
+    Session,
+    cloud_to_message,
+    constraints_to_message,
+    image_from_message,
+    scan_from_message,
+    window_from_message,
+)
+from vli_common.node import VliNode, run_node
+from vli_common.status import Health
+from vli_common.topics import CLOUD, IMAGE_LONG, LASER_POINTS, MAP, MAP_CONSTRAINTS, MAP_UPDATE, WINDOW
+from vli_common.types import Counters, Image, LaserScan, PointCloud, WindowPoses
+from vli_mapping.config import MappingConfig
+from vli_mapping.mapper import Mapper
+from vli_mapping.store import write_ply
+from vli_mapping.warm_up import warm_up
+
+_MAP_PERIOD_S = 2.0
+
+
+@dataclass(frozen=True)
+class StoreConfig:
+    """Where the map is saved."""
+
+    save_path: str = parameter("map.ply", doc="file that ~/save writes; relative to the directory the node runs in")
+
+
+class MappingNode(VliNode):
+    """Coloured map, and window-to-map correspondences, eq. (4)."""
+
+    def __init__(self) -> None:
+        super().__init__("mapping_node", {MappingConfig: "", StoreConfig: ""})
+        self._mapper: Mapper | None = None
+        self._published_points = -1
+        for topic in (CLOUD, MAP, MAP_UPDATE, MAP_CONSTRAINTS):
+            self.advertise(topic)
+        self.receive(IMAGE_LONG, lambda message: image_from_message(message, self.session), self._on_image)
+        self.receive(LASER_POINTS, scan_from_message, self._on_scan)
+        self.receive(WINDOW, window_from_message, self._on_window)
+        self.serve("save", self._save)
+        self.serve("clear", self._clear)
+        self.create_timer(_MAP_PERIOD_S, lambda: self.enqueue(self._publish_map))
+
+    def create_stage(self, calibration: Calibration | None) -> None:
+        """Make the mapper."""
+        if calibration is not None:
+            warm_up()
+            self._mapper = Mapper(calibration, self.parameters.config(MappingConfig), self.mode)
+
+    def on_session(self, session: Session) -> None:
+        """Begin a map."""
+        self.mapper.reset(session.number)
+
+    def on_finish(self) -> None:
+        """Publish the map as it is in the end."""
+        self._publish_map()
+
+    def stage_counters(self) -> Counters:
+        """Return the counters of the mapper."""
+        return self._mapper.counters if self._mapper else Counters()
+
+    def stage_status(self) -> tuple[Health, str, dict[str, str]]:
+        """Return the size of the map."""
+        return Health.OK, "", {"points": str(len(self._mapper.map) if self._mapper else 0)}
+
+    @property
+    def mapper(self) -> Mapper:
+        """The mapper, which is there once the node is ready."""
+        return self.existing(self._mapper)
+
+    def _on_image(self, image: Image) -> None:
+        self.mapper.add_image(image)
+
+    def _on_scan(self, scan: LaserScan) -> None:
+        self.mapper.add_scan(scan)
+
+    def _on_window(self, window: WindowPoses) -> None:
+        output = self.mapper.add_window(window)
+        if output.constraints is not None:
+            self.send(MAP_CONSTRAINTS, constraints_to_message(output.constraints))
+        if output.cloud is not None and self.has_listener(CLOUD):
+            self.send(CLOUD, cloud_to_message(output.cloud))
+        if output.update is not None and self.has_listener(MAP_UPDATE):
+            self.send(MAP_UPDATE, cloud_to_message(output.update))
+
+    def _publish_map(self) -> None:
+        """Publish the whole map where someone listens and it has changed."""
+        if self._mapper is None or not self.has_listener(MAP) or len(self._mapper.map) == self._published_points:
+            return
+        self._published_points = len(self._mapper.map)
+        limit = self.parameters.config(MappingConfig).max_published_points
+        stamp_ns = self.get_clock().now().nanoseconds
+        self.send(MAP, cloud_to_message(self._mapper.map.thinned(limit, stamp_ns, self.session)))
+
+    def _save(self) -> str:
+        """Write the map in the worker, where nothing changes it meanwhile, and answer when that is done."""
+        path = Path(self.parameters.config(StoreConfig).save_path).absolute()
+        cloud: PointCloud = self.call(lambda: self.mapper.map.cloud())
+        if not len(cloud):
+            raise OutputError(f"the map is empty, '{path}' is not written")
+        write_ply(path, cloud)
+        return f"{len(cloud)} points in '{path}'"
+
+    def _clear(self) -> str:
+        self.call(lambda: self.mapper.reset(self.session))
+        return "the map is empty"
+
+
+def main() -> None:
+    """Run the node."""
+    sys.exit(run_node(MappingNode))
+
+
+if __name__ == "__main__":
+    main()
