@@ -28,11 +28,11 @@ $(VENV)/.installed: requirements.txt requirements-dev.txt requirements.lock $(BU
 	@touch $@
 
 test: lint
-	$(BIN)/python -m pytest -m "not slow"
+	$(BIN)/python -m pytest -m "not slow and not perf"
 
 test-all: lint $(NUMPY1_VENV)/.installed
 	$(BIN)/python -m pytest
-	$(NUMPY1_VENV)/bin/python -m pytest -m "not slow and not lint"
+	$(NUMPY1_VENV)/bin/python -m pytest -m "not slow and not perf and not lint"
 
 $(NUMPY1_VENV)/.installed: requirements-numpy1.lock $(BUILD_FILES)
 	$(PYTHON) -m venv $(NUMPY1_VENV)

@@ -18,12 +18,14 @@ setup(
     ],
     install_requires=[
         "vli_common==0.1.0",
-        "mcap>=1.1",
+        "lz4>=4.0",
         "numba>=0.59",
         "numpy>=1.26",
         "opencv-python-headless>=4.6,<5",
+        "PyYAML>=6.0",
         "rosbags>=0.10",
         "simplejpeg>=1.7",
+        "zstandard>=0.20",
     ],
     zip_safe=False,
     entry_points={

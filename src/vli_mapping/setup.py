@@ -20,7 +20,6 @@ setup(
         "vli_common==0.1.0",
         "numba>=0.59",
         "numpy>=1.26",
-        "scipy>=1.11",
     ],
     zip_safe=False,
     entry_points={

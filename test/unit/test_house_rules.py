@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import ast
+import re
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 
@@ -26,6 +28,8 @@ MAY_IMPORT = {
 ROS = {"rclpy", "builtin_interfaces", "rcl_interfaces", "launch", "launch_ros", "ament_index_python", "tf2_ros", "std_srvs"}
 DISTRIBUTIONS = {"cv2": "opencv-python-headless", "yaml": "PyYAML"}
 """Import name → name on the package index, where they differ."""
+
+DOTTED = re.compile(r"vli_\w+(\.\w+)+")
 
 
 @dataclass(frozen=True)
@@ -53,12 +57,14 @@ class Module:
         return str(self.path.relative_to(SOURCES))
 
     def imports(self) -> Iterator[tuple[int, str]]:
-        """Yield line and top-level package of each absolute import, wherever it stands."""
+        """Yield line and top-level package of each absolute import, wherever it stands; names for importlib too."""
         for item in ast.walk(self.tree):
             if isinstance(item, ast.Import):
                 yield from ((item.lineno, alias.name.split(".")[0]) for alias in item.names)
             elif isinstance(item, ast.ImportFrom) and item.module and not item.level:
                 yield item.lineno, item.module.split(".")[0]
+            elif isinstance(item, ast.Constant) and isinstance(item.value, str) and DOTTED.fullmatch(item.value):
+                yield item.lineno, item.value.split(".")[0]
 
 
 MODULES = [Module(path) for path in sorted(SOURCES.glob("*/vli_*/**/*.py"))]
@@ -149,3 +155,11 @@ def test_setup_py_requires_what_is_imported_and_nothing_else(package):
     imported = {name for module in MODULES if module.package == package for _, name in module.imports()}
     third_party = {name for name in imported if name not in sys.stdlib_module_names and not is_ros(name) and name != package}
     assert {DISTRIBUTIONS.get(name, name).lower() for name in third_party} == install_requires(package)
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_package_xml_names_every_package_of_ros_and_ours_that_is_imported(package):
+    imported = {name for module in MODULES if module.package == package for _, name in module.imports()}
+    wanted = {name for name in imported if (is_ros(name) or name in PACKAGES) and name != package}
+    depends = {item.text for item in ElementTree.parse(SOURCES / package / "package.xml").iter("exec_depend")}
+    assert wanted - depends == set()
