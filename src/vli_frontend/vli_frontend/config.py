@@ -12,7 +12,7 @@ class KltConfig:
     """Tracking of points from one long frame to the next, and to the patch seen at birth."""
 
     normalisation_px: int = parameter(
-        21, unit="px", minimum=5, maximum=63, doc="width of the local mean and standard deviation; wider: more texture, less immune to the on-board light"
+        21, unit="px", minimum=1, maximum=63, doc="width of the local mean and standard deviation, 1: none; wider: more texture, less immune to the on-board light"
     )
     window_px: int = parameter(21, unit="px", minimum=7, maximum=41, doc="window of Lucas–Kanade; wider: steadier on weak texture, slower, blurs depth edges")
     pyramid_levels: int = parameter(4, minimum=0, maximum=6, doc="halvings of the image; more: faster motion can be followed")

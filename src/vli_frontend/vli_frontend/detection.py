@@ -15,7 +15,7 @@ _NOISE_RESPONSE = 2e-5
 """Corner response of sensor noise on an empty area (OpenCV's scale, half-size image): nothing below is a corner."""
 
 
-def detect(grey: ByteArray, existing: FloatArray, count: int, config: DetectionConfig) -> FloatArray:
+def detect(half: ByteArray, existing: FloatArray, count: int, config: DetectionConfig) -> FloatArray:
     """Return up to ``count`` new corners (M, 2) in pixels, at least ``distance_px`` from each other and from ``existing`` (N, 2).
 
     The response (least eigenvalue of the structure tensor, Shi and Tomasi, 1994) is taken at half the size, which costs a tenth; each point
@@ -23,7 +23,7 @@ def detect(grey: ByteArray, existing: FloatArray, count: int, config: DetectionC
     """
     if count <= 0:
         return np.empty((0, 2))
-    response = cv2.cornerMinEigenVal(cv2.pyrDown(grey), _BLOCK)
+    response = cv2.cornerMinEigenVal(half, _BLOCK)
     _clear_border(response, (MARGIN_PX + 2) // 2)
     peaks = _peaks(response, max(config.quality * float(response.max()), _NOISE_RESPONSE))
     half = _choose(response, peaks, existing / 2, count, config.distance_px / 2, config.cells)

@@ -7,31 +7,36 @@ import numpy as np
 
 from vli_common.arrays import BoolArray, ByteArray, Float32Array, FloatArray
 from vli_frontend.config import KltConfig
+from vli_frontend.photometry import Frame
 
 _CRITERIA = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 20, 0.01)
-_BACKWARD_LEVELS = 1
+_BACKWARD_LEVELS = 0
 """The way back starts where the point came from: it only has to show that the match is mutual."""
+_SCALE = 0.5
 
 
-def follow(previous: ByteArray, current: ByteArray, pixels: FloatArray, predicted: FloatArray, config: KltConfig) -> tuple[FloatArray, BoolArray]:
-    """Track points from one image to the next.
+def follow(
+    previous: Frame, current: Frame, pixels: FloatArray, predicted: FloatArray, config: KltConfig
+) -> tuple[FloatArray, BoolArray]:
+    """Track points from one frame to the next, on the normalised images of half the size.
 
     Args:
-        previous, current: (H, W) uint8.
-        pixels: (N, 2) in the previous image.
+        previous, current: frames.
+        pixels: (N, 2) in the previous frame, full size.
         predicted: (N, 2) where the search starts in the current one.
-        config: window, pyramid, threshold.
+        config: window and pyramid (full size), threshold.
 
     Returns:
-        Positions (N, 2) in the current image, and (N,) True where found and back within ``forward_backward_px``.
+        Positions (N, 2) in the current frame, and (N,) True where found and back within ``forward_backward_px``.
     """
     if not len(pixels):
         return np.empty((0, 2)), np.empty(0, np.bool_)
-    source = pixels.astype(np.float32)
-    found, ok = _lucas_kanade(previous, current, source, predicted.astype(np.float32), config.window_px, config.pyramid_levels)
-    back, ok_back = _lucas_kanade(current, previous, found, source, config.window_px, min(_BACKWARD_LEVELS, config.pyramid_levels))
-    close = np.abs(back - source).max(axis=1) <= config.forward_backward_px
-    return found.astype(np.float64), ok & ok_back & close
+    window, levels = 2 * (config.window_px // 4) + 1, max(config.pyramid_levels - 1, 0)
+    source, start = (_SCALE * pixels).astype(np.float32), (_SCALE * predicted).astype(np.float32)
+    found, ok = _lucas_kanade(previous.normalised, current.normalised, source, start, window, levels)
+    back, ok_back = _lucas_kanade(current.normalised, previous.normalised, found, source, window, _BACKWARD_LEVELS)
+    close = np.abs(back - source).max(axis=1) <= _SCALE * config.forward_backward_px
+    return found.astype(np.float64) / _SCALE, ok & ok_back & close
 
 
 def _lucas_kanade(

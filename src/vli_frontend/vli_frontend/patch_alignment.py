@@ -19,18 +19,21 @@ from numba import njit
 from vli_common.arrays import BoolArray, ByteArray, Float32Array, FloatArray, IntArray
 
 RADIUS = 10
-"""Half width of a patch, pixels."""
+"""Of a patch, pixels."""
 MARGIN_PX = RADIUS + 2
 """A patch needs this distance from the image border (one pixel more than it covers, for the gradient)."""
-_SIDE = 2 * RADIUS + 1
-_PIXELS = _SIDE * _SIDE
 _UNKNOWNS = 10
 _WEIGHT_SIGMA_PX = 5.0
 _CONVERGED_PX = 0.01
 _ITERATIONS = 10
 
-_V, _U = (grid.ravel().astype(np.float32) for grid in np.mgrid[-RADIUS : RADIUS + 1, -RADIUS : RADIUS + 1] / RADIUS)
-_WEIGHT = np.exp(-0.5 * (RADIUS / _WEIGHT_SIGMA_PX) ** 2 * (_U**2 + _V**2)).astype(np.float32)
+_DY, _DX = np.mgrid[-RADIUS : RADIUS + 1, -RADIUS : RADIUS + 1]
+# The corners of the square weigh less than 0.13; leaving them out saves a quarter of the time.
+_INSIDE = _DX**2 + _DY**2 <= (RADIUS + 0.25) ** 2
+_X, _Y = _DX[_INSIDE].astype(np.float32), _DY[_INSIDE].astype(np.float32)
+_U, _V = _X / np.float32(RADIUS), _Y / np.float32(RADIUS)
+_WEIGHT = np.exp(-0.5 * (_X**2 + _Y**2) / _WEIGHT_SIGMA_PX**2).astype(np.float32)
+_PIXELS = len(_X)
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,46 +80,56 @@ class PatchTemplates:
         return Aligned(pixels, warps, converged, correlation)
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, fastmath=True, error_model="numpy")
 def _sample(grey: ByteArray, x: float, y: float, warp: FloatArray, out: Float32Array) -> None:
     """Write the bilinear values (_PIXELS,) of the image under the warp; beyond the border its edge is repeated."""
     height, width = grey.shape
     limit_x, limit_y = np.float32(width - 1.001), np.float32(height - 1.001)
-    zero, one = np.float32(0.0), np.float32(1.0)
+    centre_x, centre_y = np.float32(x), np.float32(y)
     a, b, c, d = np.float32(warp[0, 0]), np.float32(warp[0, 1]), np.float32(warp[1, 0]), np.float32(warp[1, 1])
-    k = 0
-    for j in range(-RADIUS, RADIUS + 1):
-        row_x, row_y = np.float32(x) + b * np.float32(j), np.float32(y) + d * np.float32(j)
-        for i in range(-RADIUS, RADIUS + 1):
-            px = min(max(row_x + a * np.float32(i), zero), limit_x)
-            py = min(max(row_y + c * np.float32(i), zero), limit_y)
-            ix, iy = int(px), int(py)
-            fx, fy = px - np.float32(ix), py - np.float32(iy)
-            top = (one - fx) * np.float32(grey[iy, ix]) + fx * np.float32(grey[iy, ix + 1])
-            bottom = (one - fx) * np.float32(grey[iy + 1, ix]) + fx * np.float32(grey[iy + 1, ix + 1])
-            out[k] = (one - fy) * top + fy * bottom
-            k += 1
+    zero, next_one = np.float32(0.0), np.uint32(1)
+    for k in range(_PIXELS):
+        px = min(max(centre_x + a * _X[k] + b * _Y[k], zero), limit_x)
+        py = min(max(centre_y + c * _X[k] + d * _Y[k], zero), limit_y)
+        # Unsigned indices spare the test for negative ones, which would keep the loop from being vectorised.
+        ix, iy = np.uint32(np.int32(px)), np.uint32(np.int32(py))
+        fx, fy = px - np.float32(ix), py - np.float32(iy)
+        left, right = np.float32(grey[iy, ix]), np.float32(grey[iy, ix + next_one])
+        lower_left, lower_right = np.float32(grey[iy + next_one, ix]), np.float32(grey[iy + next_one, ix + next_one])
+        top, bottom = left + fx * (right - left), lower_left + fx * (lower_right - lower_left)
+        out[k] = top + fy * (bottom - top)
 
 
 @njit(cache=True, fastmath=True)
-def _fill_rows(grey: ByteArray, x: float, y: float, patch: Float32Array, rows: FloatArray) -> None:
-    """Write the patch (_PIXELS,) and the rows (_UNKNOWNS, _PIXELS) of the linear model at one point."""
-    identity = np.eye(2)
-    sides = np.empty((4, _PIXELS), np.float32)
-    _sample(grey, x, y, identity, patch)
-    _sample(grey, x - 1, y, identity, sides[0])
-    _sample(grey, x + 1, y, identity, sides[1])
-    _sample(grey, x, y - 1, identity, sides[2])
-    _sample(grey, x, y + 1, identity, sides[3])
-    mean = 0.0
+def _sample_square(grey: ByteArray, x: float, y: float, out: Float32Array) -> None:
+    """Write the bilinear values of an upright square centred on a point, all inside the image."""
+    size = len(out)
+    ix, iy = int(x) - size // 2, int(y) - size // 2
+    fx, fy = np.float32(x - int(x)), np.float32(y - int(y))
+    one = np.float32(1.0)
+    for j in range(size):
+        upper, lower = grey[iy + j, ix : ix + size + 1], grey[iy + j + 1, ix : ix + size + 1]
+        for i in range(size):
+            top = (one - fx) * np.float32(upper[i]) + fx * np.float32(upper[i + 1])
+            bottom = (one - fx) * np.float32(lower[i]) + fx * np.float32(lower[i + 1])
+            out[j, i] = (one - fy) * top + fy * bottom
+
+
+@njit(cache=True, fastmath=True)
+def _fill_rows(square: Float32Array, patch: Float32Array, rows: Float32Array) -> None:
+    """Write the patch (_PIXELS,) and the rows (_UNKNOWNS, _PIXELS) of the linear model from its square with a rim of one."""
+    half, total = np.float32(0.5), np.float32(0.0)
     for k in range(_PIXELS):
-        mean += patch[k] / _PIXELS
+        i, j = int(_X[k]) + RADIUS + 1, int(_Y[k]) + RADIUS + 1
+        patch[k] = square[j, i]
+        rows[0, k] = half * (square[j, i + 1] - square[j, i - 1])
+        rows[1, k] = half * (square[j + 1, i] - square[j - 1, i])
+        total += patch[k]
+    mean = total / np.float32(_PIXELS)
     for k in range(_PIXELS):
-        gx, gy = 0.5 * (sides[1, k] - sides[0, k]), 0.5 * (sides[3, k] - sides[2, k])
-        rows[0, k], rows[1, k] = gx, gy
-        rows[2, k], rows[3, k] = gx * _U[k], gx * _V[k]
-        rows[4, k], rows[5, k] = gy * _U[k], gy * _V[k]
-        rows[6, k], rows[7, k] = patch[k] - mean, 1.0
+        rows[2, k], rows[3, k] = rows[0, k] * _U[k], rows[0, k] * _V[k]
+        rows[4, k], rows[5, k] = rows[1, k] * _U[k], rows[1, k] * _V[k]
+        rows[6, k], rows[7, k] = patch[k] - mean, np.float32(1.0)
         rows[8, k], rows[9, k] = _U[k] * patch[k], _V[k] * patch[k]
 
 
@@ -153,34 +166,45 @@ def _invert(matrix: FloatArray) -> bool:
 
 @njit(cache=True, fastmath=True)
 def _create(
-    grey: ByteArray, slots: IntArray, pixels: FloatArray, solvers: Float32Array, patches: Float32Array, valid: BoolArray, sigma: FloatArray
+    grey: ByteArray,
+    slots: IntArray,
+    pixels: FloatArray,
+    solvers: Float32Array,
+    patches: Float32Array,
+    valid: BoolArray,
+    sigma: FloatArray,
 ) -> None:
-    rows = np.empty((_UNKNOWNS, _PIXELS))
+    square = np.empty((2 * RADIUS + 3, 2 * RADIUS + 3), np.float32)
+    rows = np.empty((_UNKNOWNS, _PIXELS), np.float32)
     normal = np.empty((_UNKNOWNS, _UNKNOWNS))
     for n in range(len(slots)):
         slot = slots[n]
-        _fill_rows(grey, pixels[n, 0], pixels[n, 1], patches[slot], rows)
+        _sample_square(grey, pixels[n, 0], pixels[n, 1], square)
+        _fill_rows(square, patches[slot], rows)
         for i in range(_UNKNOWNS):
             for j in range(i + 1):
-                total = 0.0
+                total = np.float32(0.0)
                 for k in range(_PIXELS):
                     total += rows[i, k] * rows[j, k] * _WEIGHT[k]
                 normal[i, j] = normal[j, i] = total
         valid[slot] = _invert(normal)
         sigma[slot] = np.inf
-        if not valid[slot]:
-            continue
-        for i in range(_UNKNOWNS):
+        if valid[slot]:
+            _fill_solver(rows, normal, solvers[slot])
+            sigma[slot] = math.sqrt(0.5 * ((solvers[slot, :2] ** 2).sum()))
+
+
+@njit(cache=True, fastmath=True)
+def _fill_solver(rows: Float32Array, inverse: FloatArray, solver: Float32Array) -> None:
+    """Write (JᵀWJ)⁻¹ JᵀW, (_UNKNOWNS, _PIXELS)."""
+    for i in range(_UNKNOWNS):
+        solver[i] = 0.0
+        for j in range(_UNKNOWNS):
+            factor = np.float32(inverse[i, j])
             for k in range(_PIXELS):
-                total = 0.0
-                for j in range(_UNKNOWNS):
-                    total += normal[i, j] * rows[j, k]
-                solvers[slot, i, k] = total * _WEIGHT[k]
-        variance = 0.0
-        for i in range(2):
-            for k in range(_PIXELS):
-                variance += 0.5 * solvers[slot, i, k] ** 2
-        sigma[slot] = math.sqrt(variance)
+                solver[i, k] += factor * rows[j, k]
+        for k in range(_PIXELS):
+            solver[i, k] *= _WEIGHT[k]
 
 
 @njit(cache=True, fastmath=True)

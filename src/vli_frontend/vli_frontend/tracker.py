@@ -108,7 +108,7 @@ class Tracker:
     def replenish(self, frame: Frame) -> None:
         """Detect new points where there are few, up to the greatest number."""
         tracks = self.tracks
-        pixels = detect(frame.grey, tracks.pixels, self._config.max_features - len(tracks), self._config.detection)
+        pixels = detect(frame.half, tracks.pixels, self._config.max_features - len(tracks), self._config.detection)
         count = len(pixels)
         slots = np.setdiff1d(np.arange(self._config.max_features), tracks.slots)[:count]
         ids = np.arange(self._next_id, self._next_id + count)
@@ -121,7 +121,7 @@ class Tracker:
     def _advance(self, previous: Frame, frame: Frame, dt_s: float, rotation: FloatArray | None) -> None:
         tracks = self.tracks
         turned = tracks.pixels if rotation is None else self._turn(tracks.rays, tracks.pixels, rotation)
-        found, ok = follow(previous.normalised, frame.normalised, tracks.pixels, turned + tracks.flow * dt_s, self._config.klt)
+        found, ok = follow(previous, frame, tracks.pixels, turned + tracks.flow * dt_s, self._config.klt)
         ok &= self._inside(found)
         self._counters.add("tracks_lost", int((~ok).sum()))
         tracks.keep(ok)
