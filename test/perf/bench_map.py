@@ -120,7 +120,7 @@ def print_accuracy(mapper: Mapper, data: Path) -> None:
     surface = surface_figures(surface_distances(cloud.points.astype(np.float64), read_surface(data / "surface.ply")))
     seen = read_cloud(data / "seen.ply")
     covered, nearest = nearest_map_points(seen.points, cloud.points)
-    complete = completeness_figures(covered, seen.rgb[covered], cloud.colours[nearest[covered]])
+    complete = completeness_figures(covered, (seen.colours[covered], cloud.colours[nearest[covered]]))
     print(f"points {len(cloud)}; point-to-plane {surface.map_point_to_plane_rmse_mm:.4f} mm RMSE ({surface.map_point_to_plane_median_mm:.4f} median), "
           f"point-to-point {surface.map_point_to_point_rmse_mm:.4f}; beyond 0.5 mm {surface.beyond_0_5mm_percent:.3f} %, 1 mm "
           f"{surface.beyond_1mm_percent:.3f} %; complete {complete.completeness_percent:.2f} %; "
