@@ -119,15 +119,23 @@ class BagReader:
         first = next(self._raw(wanted - {self.exposure_topic or ""}), None)
         if first is None:
             return
-        begin_ns = cdr.header_stamp(first.data) + self._start_ns
+        begin_ns = self._stamp(first) + self._start_ns
         end_ns = None if self._duration_ns is None else begin_ns + self._duration_ns
         log_begin = first.log_ns + self._start_ns
         # Log and header clocks may differ by an offset and some latency: a margin keeps what the header stamps select.
         log_end = None if self._duration_ns is None else log_begin + self._duration_ns + _LOG_MARGIN_NS
         for message in self._raw(wanted, log_begin - _LOG_MARGIN_NS, log_end):
-            stamp_ns = cdr.header_stamp(message.data)
+            stamp_ns = self._stamp(message)
             if stamp_ns >= begin_ns and (end_ns is None or stamp_ns < end_ns):
                 yield message
+
+    @staticmethod
+    def _stamp(message: RawMessage) -> int:
+        """Return the header stamp, for a malformed message (which is dropped later) its log time."""
+        try:
+            return cdr.header_stamp(message.data)
+        except MessageError:
+            return message.log_ns
 
     def _raw(self, topics: set[str], start_ns: int = 0, end_ns: int | None = None) -> Iterator[RawMessage]:
         streams = [file.messages(topics, start_ns, end_ns) for file in self.files]
