@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
@@ -11,18 +11,19 @@ from embreex.rtcore_scene import EmbreeScene
 from vli_common.arrays import BoolArray, Float32Array, FloatArray
 from vli_simulation.mesh import Mesh, vertex_normals
 
+Int32Array: TypeAlias = np.ndarray[tuple[int, ...], np.dtype[np.int32]]
+
 _CLEARANCE = 0.998
 """A shadow ray ends this share of the way before the surface: 60 µm at 30 mm, lest it hit where it started."""
 
 
-@dataclass(frozen=True)
-class Hits:
+class Hits(NamedTuple):
     """First hits of N rays: distance in lengths of the direction, barycentric u, v, triangle (−1 where nothing was hit)."""
 
     distance: Float32Array
     u: Float32Array
     v: Float32Array
-    triangle: np.ndarray[tuple[int, ...], np.dtype[np.int32]]
+    triangle: Int32Array
 
 
 class RayCaster:

@@ -41,7 +41,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, help="directory to write; refused where it has content")
     parser.add_argument("--overwrite", action="store_true", help="replace an existing directory")
     parser.add_argument("--seed", type=int, default=0, help="of everything that is random; same seed, same recording")
-    parser.add_argument("--preset", choices=tuple(PRESETS), default="short", help="5 s, 25 s (two passes) or 132 s (six passes, 185 cm)")
+    parser.add_argument(
+        "--preset", choices=tuple(PRESETS), default="short", help="5 s, 25 s (two passes) or 132 s (six passes, 185 cm)"
+    )
     parser.add_argument("--workers", type=int, default=None, help="threads; the result does not depend on it")
     parser.add_argument("--no-rest", action="store_true", help="starts in full motion")
     parser.add_argument("--resolution", metavar="WxH", help="pixels, e.g. 640x480")
@@ -69,7 +71,8 @@ def run(args: argparse.Namespace) -> int:
         shutil.rmtree(args.out)
     partial.rename(args.out)
     wall = time.monotonic() - start
-    sys.stdout.write(f"{args.out}: {len(simulation)} frames, {simulation.path_length:.3f} m, {wall:.1f} s, {len(simulation) / wall:.1f} frames/s\n")
+    rate = len(simulation) / wall
+    sys.stdout.write(f"{args.out}: {len(simulation)} frames, {simulation.path_length:.3f} m, {wall:.1f} s, {rate:.1f} frames/s\n")
     return 0
 
 

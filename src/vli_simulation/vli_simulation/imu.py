@@ -38,14 +38,18 @@ def record_imu(trajectory: Trajectory, config: ImuConfig, start_ns: int, duratio
     count = int((duration_s + 2 * _LEAD_S) * config.rate_hz)
     offsets_ns = np.round((np.arange(count) / config.rate_hz - _LEAD_S) * NANOSECONDS).astype(np.int64)
     state = trajectory.imu(offsets_ns / NANOSECONDS)
-    force = np.einsum("nji,nj->ni", state.T_world_imu[:, :3, :3], state.acceleration + [0.0, 0.0, GRAVITY])
+    force = np.einsum("nji,nj->ni", state.T_world_imu[:, :3, :3], state.acceleration + np.array([0.0, 0.0, GRAVITY]))
     rng = np.random.default_rng([seed, 3])
     gyro_bias = _bias(rng, count, config, config.gyroscope_bias, config.gyroscope_random_walk)
     accel_bias = _bias(rng, count, config, config.accelerometer_bias, config.accelerometer_random_walk)
     gyro_noise = _white(rng, count, config, config.gyroscope_noise_density)
     accel_noise = _white(rng, count, config, config.accelerometer_noise_density)
     return ImuRecording(
-        offsets_ns + start_ns, state.angular_velocity + gyro_bias + gyro_noise, force + accel_bias + accel_noise, gyro_bias, accel_bias
+        offsets_ns + start_ns,
+        state.angular_velocity + gyro_bias + gyro_noise,
+        force + accel_bias + accel_noise,
+        gyro_bias,
+        accel_bias,
     )
 
 

@@ -32,7 +32,9 @@ class Mesh:
 def make_mesh(vertices: FloatArray, faces: IntArray, material: int, tile: int = -1, uv: FloatArray | None = None) -> Mesh:
     """Return a mesh of one material, with at most one printed tile."""
     count = len(faces)
-    return Mesh(vertices, faces, np.full(count, material), np.full(count, tile), np.zeros((len(vertices), 2)) if uv is None else uv)
+    return Mesh(
+        vertices, faces, np.full(count, material), np.full(count, tile), np.zeros((len(vertices), 2)) if uv is None else uv
+    )
 
 
 def join(meshes: Sequence[Mesh]) -> Mesh:
@@ -79,7 +81,9 @@ def rounded_rectangle(half_x: float, half_y: float, radius: float, corner: int =
     for quarter in range(4):
         angle = np.pi / 2 * (quarter + np.arange(corner) / (corner - 1))
         sign_x, sign_y = (1, -1, -1, 1)[quarter], (1, 1, -1, -1)[quarter]
-        arc = np.stack([sign_x * (half_x - radius) + radius * np.cos(angle), sign_y * (half_y - radius) + radius * np.sin(angle)], axis=1)
+        arc = np.stack(
+            [sign_x * (half_x - radius) + radius * np.cos(angle), sign_y * (half_y - radius) + radius * np.sin(angle)], axis=1
+        )
         points.append(arc)
     outline = []
     for quarter in range(4):
@@ -90,7 +94,7 @@ def rounded_rectangle(half_x: float, half_y: float, radius: float, corner: int =
 
 
 def loft(rings: Sequence[FloatArray], apex: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Return (vertices, faces) of a shell through rings (K, 3), counter-clockwise seen from above and rising, closed by an apex (3,)."""
+    """Return (vertices, faces) of a shell through rising rings (K, 3), counter-clockwise from above, closed by an apex (3,)."""
     count = len(rings[0])
     vertices = np.concatenate([*rings, apex[None]])
     last = (len(rings) - 1) * count + np.arange(count)

@@ -6,6 +6,7 @@ A plan (passes, sway, tremor) is sampled every 10 ms and interpolated by quintic
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -105,7 +106,8 @@ def plan_motion(config: MotionConfig, path: ScanPath, rig: Rig, stripe_angle_deg
     along, bounds = _progress(config, times)
     if (reach := float(np.ptp(along))) > path.length:
         raise SimulationError(
-            f"a pass of '{reach:.3f}' m is longer than the scene, which has {path.length:.3f} m; more --passes or less --speed or --duration"
+            f"a pass of '{reach:.3f}' m is longer than the scene, which has {path.length:.3f} m; "
+            "more --passes or less --speed or --duration"
         )
     along = along + 0.5 * (path.length - reach)
     envelope = _smooth_step((times - config.rest_s) / _RAMP_S) if config.rest_s > 0 else np.ones_like(times)
@@ -119,7 +121,7 @@ def plan_motion(config: MotionConfig, path: ScanPath, rig: Rig, stripe_angle_deg
 
 
 def _progress(config: MotionConfig, times: FloatArray) -> tuple[FloatArray, list[tuple[float, float]]]:
-    """Return metres along the path at each time and the bounds of the passes; the mean speed while moving is the one asked for."""
+    """Return metres along the path at each time and the passes' bounds; the mean speed while moving is the one asked for."""
     moving = config.duration_s - config.rest_s
     if moving <= 0:
         return np.zeros_like(times), [(0.0, config.duration_s)]
@@ -132,11 +134,11 @@ def _progress(config: MotionConfig, times: FloatArray) -> tuple[FloatArray, list
     velocity = velocity * config.speed / mean
     along = np.concatenate([[0.0], np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * _NODE_S)])
     starts = [0.0, *turns[1:]]
-    return along - along[inside].min(), list(zip(starts[:-1], starts[1:], strict=True))
+    return along - along[inside].min(), list(itertools.pairwise(starts))
 
 
 def _hand(config: MotionConfig, times: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
-    """Return wandering (N, 3) metres along, across and away from the surface, and rotation vectors (N, 3) in the camera frame."""
+    """Return wandering (N, 3) metres along, across, away from the surface; rotation vectors (N, 3) in the camera frame."""
     sway = _oscillation(rng, times, _SWAY_HZ, 5) * config.sway
     tremor = _oscillation(rng, times, _TREMOR_HZ, 8) * config.tremor
     reach = config.distance / 0.03

@@ -58,7 +58,7 @@ class Lens:
             exposure_s: of the shutter.
             gain: grey levels of radiance 1 in the middle of the image.
         """
-        soft = cv2.GaussianBlur(image, (0, 0), _DEFOCUS_PX)
+        soft: Float32Array = np.asarray(cv2.GaussianBlur(image, (0, 0), _DEFOCUS_PX), dtype=np.float32)
         seen = depth[depth > 0]
         nearest = float(seen.min()) if len(seen) else np.inf
         fastest = 1.5 * self._focal_px * float(np.linalg.norm(velocity) / nearest + 2.0 * np.linalg.norm(rate))
@@ -86,7 +86,9 @@ class Lens:
     def _jacobians(self, camera: CameraModel, rays: FloatArray) -> Float32Array:
         """Return the derivatives of pixels by rays (H·W, 4), row by row."""
         step = 1e-5
-        columns = [(camera.to_pixels(rays + offset) - camera.to_pixels(rays - offset)) / (2 * step) for offset in step * np.eye(2)]
+        columns = [
+            (camera.to_pixels(rays + offset) - camera.to_pixels(rays - offset)) / (2 * step) for offset in step * np.eye(2)
+        ]
         return np.stack(columns, axis=-1).reshape(-1, 4).astype(np.float32)
 
 
@@ -107,7 +109,19 @@ def _with_depth(rays: FloatArray) -> Float32Array:
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
-def _integrate(image, depth, rays, jacobian, velocity, rate, exposure, threshold, gain, vignette, out):
+def _integrate(
+    image: Float32Array,
+    depth: Float32Array,
+    rays: Float32Array,
+    jacobian: Float32Array,
+    velocity: FloatArray,
+    rate: FloatArray,
+    exposure: float,
+    threshold: float,
+    gain: float,
+    vignette: Float32Array,
+    out: Float32Array,
+) -> None:
     """Average the mosaic's channel of ``image`` along the image motion; a fixed point moves by −v − ω × X in the camera frame."""
     height, width = depth.shape
     for i in range(height):
@@ -122,7 +136,7 @@ def _integrate(image, depth, rays, jacobian, velocity, rate, exposure, threshold
             du = exposure * (jacobian[n, 0] * dx + jacobian[n, 1] * dy)
             dv = exposure * (jacobian[n, 2] * dx + jacobian[n, 3] * dy)
             longest = max(abs(du), abs(dv))
-            total = np.float64(image[i, j, c])
+            total = float(image[i, j, c])
             if longest > threshold:
                 samples = min(max(int(3.0 * longest) + 1, 3), 32)
                 total = 0.0

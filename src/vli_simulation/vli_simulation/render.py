@@ -12,7 +12,7 @@ from vli_common.geometry import inverse, transform
 from vli_simulation import gbuffer, shading
 from vli_simulation.caster import RayCaster
 from vli_simulation.config import SimulationConfig
-from vli_simulation.gbuffer import GBuffer
+from vli_simulation.gbuffer import GBuffer, Surface
 from vli_simulation.optics import SUBPIXELS, Lens
 from vli_simulation.rig import Rig
 from vli_simulation.scenes.scene import Scene
@@ -65,9 +65,13 @@ class Renderer:
         self._rig, self._config = rig, config
         self._nominal = config.motion.distance
         self._materials = np.array([material.row() for material in scene.materials])
-        self._material_of = scene.mesh.material.astype(np.uint8)
-        self._tile_of = scene.mesh.tile.astype(np.int32)
-        self._uv = np.ascontiguousarray(scene.mesh.uv, dtype=np.float32)
+        self._surface = Surface(
+            self.caster.faces,
+            self.caster.normals,
+            scene.mesh.material.astype(np.uint8),
+            scene.mesh.tile.astype(np.int32),
+            np.ascontiguousarray(scene.mesh.uv, dtype=np.float32),
+        )
         self._tiles = scene.tiles
         self._table = noise_table(seed)
         self._lens = Lens(rig.camera, config.sensor.vignetting)
@@ -83,9 +87,11 @@ class Renderer:
         """Return the short exposure with the laser on, as :meth:`long_frame`; ``rng`` draws the speckle."""
         radiance, depth = self._dim_view(view)
         exposure = self._config.sensor.exposure_short_s
-        image = self._lens.expose(radiance, depth, view.velocity, view.rate, exposure, _GREY_OF_WHITE * exposure / _NOMINAL_LONG_S)
+        image = self._lens.expose(
+            radiance, depth, view.velocity, view.rate, exposure, _GREY_OF_WHITE * exposure / _NOMINAL_LONG_S
+        )
         gain = _STRIPE_OF_WHITE * exposure / _NOMINAL_SHORT_S
-        self._lens.add_laser(self._stripe(view) * self._speckle(rng), self._rig.laser.response, gain, image)
+        self._lens.add_laser(self._speckled(self._stripe(view), rng), self._rig.laser.response, gain, image)
         return image
 
     def seen(self, view: View) -> SeenPoints:
@@ -118,12 +124,9 @@ class Renderer:
         lens = self._lens
         coarse = self._look(view, lens.coarse_rays)
         full = GBuffer.empty(lens.height * lens.width)
-        rough = np.empty(len(full), np.bool_)
-        gbuffer.enlarge(
-            view.eye, self._turn(view, lens.coarse_rays), coarse.depth, coarse.normals, coarse.material, coarse.tile, coarse.uv, coarse.lit,
-            self._turn(view, lens.rays), lens.height, lens.width,
-            full.depth, full.points, full.normals, full.material, full.tile, full.uv, full.lit, rough,
-        )  # fmt: skip
+        rough = np.empty(len(full.depth), np.bool_)
+        fine, wide = self._turn(view, lens.rays), self._turn(view, lens.coarse_rays)
+        gbuffer.enlarge(view.eye, wide, coarse, fine, lens.height, lens.width, full, rough)
         return full, rough
 
     def _dim_view(self, view: View) -> tuple[Float32Array, Float32Array]:
@@ -177,8 +180,8 @@ class Renderer:
         origin = transform(view.T_world_cam, laser.origin[None])[0]
         normal = view.T_world_cam[:3, :3] @ laser.normal
         plane = np.array([*normal, -float(normal @ origin)])
-        out = np.empty(len(buffer), np.float32)
-        shading.sheet_irradiance(buffer.points, buffer.normals, buffer.material, origin, plane, _WAIST, _DIVERGENCE, self._nominal, out)
+        out = np.empty(len(buffer.depth), np.float32)
+        shading.sheet_irradiance(buffer, origin, plane, _WAIST, _DIVERGENCE, self._nominal, out)
         cut = np.flatnonzero(out > 0)
         out[cut] *= self.caster.visible(origin, buffer.points[cut])
         return out
@@ -188,11 +191,8 @@ class Renderer:
         directions = self._turn(view, rays)
         hits = self.caster.cast(view.eye, directions)
         out = GBuffer.empty(len(rays))
-        gbuffer.resolve(
-            view.eye, directions, hits.distance, hits.u, hits.v, hits.triangle, self.caster.faces, self.caster.normals, self._material_of,
-            self._tile_of, self._uv, out.depth, out.points, out.normals, out.material, out.tile, out.uv,
-        )  # fmt: skip
-        # Depth is along the axis: rays of unit depth give it as their length, others need their own.
+        gbuffer.resolve(view.eye, directions, hits, self._surface, out)
+        # Where rays are not of unit depth, their length counts.
         out.depth[:] *= rays[:, 2]
         if with_light:
             out.lit[:] = self.caster.visible(transform(view.T_world_cam, self._rig.light[None])[0], out.points)
@@ -205,11 +205,8 @@ class Renderer:
         return out
 
     def _albedo(self, buffer: GBuffer) -> Float32Array:
-        albedo = np.empty((len(buffer), 3), np.float32)
-        shading.surface_albedo(
-            buffer.points, buffer.depth, buffer.material, buffer.tile, buffer.uv, self._rig.camera.focal_px, self._materials, self._tiles,
-            self._table, albedo,
-        )  # fmt: skip
+        albedo = np.empty((len(buffer.depth), 3), np.float32)
+        shading.surface_albedo(buffer, self._rig.camera.focal_px, self._materials, self._tiles, self._table, albedo)
         return albedo
 
     def _light(self, view: View, buffer: GBuffer) -> tuple[Float32Array, Float32Array]:
@@ -217,18 +214,19 @@ class Renderer:
         albedo = self._albedo(buffer)
         radiance = np.empty_like(albedo)
         light = transform(view.T_world_cam, self._rig.light[None])[0]
-        shading.illuminate(
-            buffer.points, buffer.normals, buffer.material, buffer.lit, self._materials, view.eye, light, view.T_world_cam[:3, 2],
-            self._nominal, albedo, radiance,
-        )  # fmt: skip
+        axis = np.ascontiguousarray(view.T_world_cam[:3, 2])
+        shading.illuminate(buffer, albedo, self._materials, np.ascontiguousarray(view.eye), light, axis, self._nominal, radiance)
         return albedo, radiance
 
-    def _speckle(self, rng: np.random.Generator) -> Float32Array:
-        """Return a log-normal field (H, W) of mean 1 whose grains are drawn out along the stripe."""
-        sigma = np.float32(np.sqrt(np.log1p(self._config.sensor.speckle**2)))
-        field = rng.standard_normal((self._lens.height, self._lens.width), dtype=np.float32)
-        result: Float32Array = np.exp(sigma * cv2.filter2D(field, -1, self._grain) - np.float32(0.5) * sigma**2)
-        return result
+    def _speckled(self, stripe: Float32Array, rng: np.random.Generator) -> Float32Array:
+        """Multiply the stripe (H, W) by a log-normal field of mean 1 whose grains are drawn out along it."""
+        rows, columns = np.flatnonzero(stripe.any(axis=1)), np.flatnonzero(stripe.any(axis=0))
+        if len(rows):
+            box = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+            sigma = np.float32(np.sqrt(np.log1p(self._config.sensor.speckle**2)))
+            field = rng.standard_normal(stripe[box].shape, dtype=np.float32)
+            stripe[box] *= np.exp(sigma * cv2.filter2D(field, -1, self._grain) - np.float32(0.5) * sigma**2)
+        return stripe
 
 
 def _grain_kernel(angle: float) -> Float32Array:

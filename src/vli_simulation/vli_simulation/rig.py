@@ -68,7 +68,9 @@ def make_rig(config: SimulationConfig, seed: int) -> Rig:
     intrinsics = _intrinsics(config, rng)
     coefficients = _LENSES[config.rig.lens]
     camera = make_camera(config.rig.lens, intrinsics, coefficients, (config.rig.width, config.rig.height))
-    T_cam_imu = pose(so3_exp(rng.normal(0, np.deg2rad(0.8), 3)) @ _R_CAM_IMU, np.array([0.005, -0.007, 0.009]) + rng.normal(0, 1e-3, 3))
+    T_cam_imu = pose(
+        so3_exp(rng.normal(0, np.deg2rad(0.8), 3)) @ _R_CAM_IMU, np.array([0.005, -0.007, 0.009]) + rng.normal(0, 1e-3, 3)
+    )
     laser = _make_laser(config, rng)
     light = np.array([-0.005, -0.006, 0.001]) if abs(config.rig.stripe_angle_deg) < 45 else np.array([-0.006, 0.005, 0.001])
     return Rig(camera, T_cam_imu, laser, light, _document(config, intrinsics, coefficients, T_cam_imu, laser))
@@ -101,7 +103,11 @@ def _make_laser(config: SimulationConfig, rng: np.random.Generator) -> LaserShee
 
 
 def _document(
-    config: SimulationConfig, intrinsics: tuple[float, ...], coefficients: tuple[float, ...], T_cam_imu: FloatArray, laser: LaserSheet
+    config: SimulationConfig,
+    intrinsics: tuple[float, ...],
+    coefficients: tuple[float, ...],
+    T_cam_imu: FloatArray,
+    laser: LaserSheet,
 ) -> dict[str, Any]:
     imu = config.imu
     return {

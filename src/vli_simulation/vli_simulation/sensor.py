@@ -58,12 +58,23 @@ class Sensor:
             return EncodedFrame(cv2.cvtColor(colour, cv2.COLOR_BGR2GRAY).tobytes(), "mono8", False, width)
         if encoding == "rgb":
             return EncodedFrame(cv2.cvtColor(colour, cv2.COLOR_BGR2RGB).tobytes(), "rgb8", False, 3 * width)
-        data = simplejpeg.encode_jpeg(np.ascontiguousarray(colour), quality=self._config.quality, colorspace="BGR", colorsubsampling="420")
+        data = simplejpeg.encode_jpeg(
+            np.ascontiguousarray(colour), quality=self._config.quality, colorspace="BGR", colorsubsampling="420"
+        )
         return EncodedFrame(data, "bgr8; jpeg compressed bgr8", True)
 
 
 @numba.njit(cache=True, nogil=True)
-def _read_out(light, response, noise, gain, read_noise, black, mosaic):
+def _read_out(
+    light: Float32Array,
+    response: Float32Array,
+    noise: Float32Array,
+    gain: float,
+    read_noise: float,
+    black: float,
+    mosaic: ByteArray,
+) -> None:
+    """Fill ``mosaic`` (H, W) with noise in electrons, full well, black level, rounding; ``gain`` is grey levels an electron."""
     height, width = mosaic.shape
     for i in range(height):
         for j in range(width):

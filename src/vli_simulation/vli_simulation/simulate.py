@@ -130,7 +130,9 @@ class SeenCloud:
         return np.concatenate(self._parts) if self._parts else np.empty(0, _SEEN_TYPE)
 
 
-def write_recording(simulation: Simulation, out: Path, workers: int | None = None, progress: Callable[[int], object] | None = None) -> None:
+def write_recording(
+    simulation: Simulation, out: Path, workers: int | None = None, progress: Callable[[int], object] | None = None
+) -> None:
     """Render everything into the directory ``out``, which exists.
 
     Args:
@@ -140,14 +142,18 @@ def write_recording(simulation: Simulation, out: Path, workers: int | None = Non
         progress: called with the number of frames done since the last call.
     """
     (out / "calibration.yaml").write_text(to_yaml(simulation.rig.document))
-    (out / "simulation.yaml").write_text(yaml.safe_dump({"seed": simulation.seed, **to_document(simulation.config)}, sort_keys=False))
+    (out / "simulation.yaml").write_text(
+        yaml.safe_dump({"seed": simulation.seed, **to_document(simulation.config)}, sort_keys=False)
+    )
     write_tum(out / "truth.tum", (int(stamp) for stamp in simulation.stamps_ns), simulation.poses)
     start_s = simulation.config.start_s
     passes = [(start_s + start, start_s + end) for start, end in simulation.motion.passes]
     write_passes(out / "passes.json", simulation.path_length, passes)
     _write_surface(simulation, out / "surface.ply")
     seen = _write_bag(simulation, out / "bag", workers or os.cpu_count() or 1, progress)
-    write_ply(out / "seen.ply", "what the laser saw, thinned to 0.25 mm; colour as lit, noise-free; albedo beside it", seen.rows())
+    write_ply(
+        out / "seen.ply", "what the laser saw, thinned to 0.25 mm; colour as lit, noise-free; albedo beside it", seen.rows()
+    )
 
 
 def _write_bag(simulation: Simulation, path: Path, workers: int, progress: Callable[[int], object] | None) -> SeenCloud:
@@ -156,7 +162,9 @@ def _write_bag(simulation: Simulation, path: Path, workers: int, progress: Calla
     threads = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        with BagWriter(path, simulation.rig, config.imu, config.sensor.encoding in ("jpeg", "bayer-png"), config.exposure_topic) as bag:
+        with BagWriter(
+            path, simulation.rig, config.imu, config.sensor.encoding in ("jpeg", "bayer-png"), config.exposure_topic
+        ) as bag:
             samples = collections.deque(simulation.imu())
             for frame in simulation.frames(workers):
                 while samples and samples[0].stamp_ns <= frame.stamp_ns:

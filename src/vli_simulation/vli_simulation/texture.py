@@ -6,10 +6,13 @@ are band-limited and do not shimmer: texture detail reaches 0.1 mm, and a pixel 
 
 from __future__ import annotations
 
+from typing import Any
+
 import numba
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
-from vli_common.arrays import Float32Array
+from vli_common.arrays import ByteArray, Float32Array, FloatArray
 
 FAST = {"contract", "arcp", "nsz"}
 """Fused multiply-add and the like: a last bit of brightness is no matter here, NaN and infinity keep their meaning."""
@@ -23,15 +26,14 @@ _LACUNARITY = 0.29
 def noise_table(seed: int) -> Float32Array:
     """Return the periodic lattice (64³,) of zero mean and unit variance; it holds two octaves, so that one look-up gives both."""
     rng = np.random.default_rng([seed, 4])
-    coarse = np.repeat(np.repeat(np.repeat(rng.standard_normal((_SIZE // 2,) * 3), 2, 0), 2, 1), 2, 2)
-    coarse = sum(np.roll(coarse, shift, (0, 1, 2)) for shift in np.ndindex(2, 2, 2)) / np.sqrt(8)
+    coarse = gaussian_filter(rng.standard_normal((_SIZE,) * 3), 1.1, mode="wrap")
     fine = rng.uniform(-np.sqrt(3), np.sqrt(3), (_SIZE,) * 3)
     table = 0.8 * coarse / coarse.std() + 0.6 * fine
     return np.ascontiguousarray(table.ravel(), dtype=np.float32)
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
-def value_noise(table, x, y, z):
+def value_noise(table: Float32Array, x: float, y: float, z: float) -> float:
     """Interpolate the lattice at (x, y, z), in cells, with a quintic fade."""
     fx, fy, fz = np.floor(x), np.floor(y), np.floor(z)
     u, v, w = x - fx, y - fy, z - fz
@@ -47,11 +49,13 @@ def value_noise(table, x, y, z):
     d = table[i1 | j1 | k] + w * (table[i1 | j1 | k1] - table[i1 | j1 | k])
     e = a + v * (b - a)
     f = c + v * (d - c)
-    return e + u * (f - e)
+    return float(e + u * (f - e))
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
-def fractal_noise(table, x, y, z, cell, octaves, persistence, footprint):
+def fractal_noise(
+    table: Float32Array, x: float, y: float, z: float, cell: float, octaves: int, persistence: float, footprint: float
+) -> float:
     """Sum ``octaves`` look-ups at (x, y, z) metres, the first with cells of ``cell`` metres; fades cells near the footprint."""
     total = 0.0
     amplitude = 1.0
@@ -71,14 +75,14 @@ def fractal_noise(table, x, y, z, cell, octaves, persistence, footprint):
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
-def _hash(i, j, k):
+def _hash(i: int | np.integer[Any], j: int | np.integer[Any], k: int | np.integer[Any]) -> np.uint32:
     h = np.uint32(i) * np.uint32(374761393) + np.uint32(j) * np.uint32(668265263) + np.uint32(k) * np.uint32(2246822519)
     h = (h ^ (h >> np.uint32(13))) * np.uint32(1274126177)
     return h ^ (h >> np.uint32(16))
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
-def speck(x, y, z, cell, density, footprint):
+def speck(x: float, y: float, z: float, cell: float, density: float, footprint: float) -> float:
     """Return the coverage by a grain of dirt, −1 (dark) to 1 (bright): at most one round grain in a cell of ``cell`` metres."""
     x, y, z = x / cell, y / cell, z / cell
     i, j, k = np.floor(x), np.floor(y), np.floor(z)
@@ -93,11 +97,11 @@ def speck(x, y, z, cell, density, footprint):
     dz = z - k - radius - room * ((g >> np.uint32(24)) & np.uint32(0xFF)) / 255.0
     edge = max(0.5 * footprint / cell, 0.03)
     inside = min(max((radius - np.sqrt(dx * dx + dy * dy + dz * dz)) / edge + 0.5, 0.0), 1.0)
-    return inside if h & np.uint32(0x10000) else -inside
+    return float(inside if h & np.uint32(0x10000) else -inside)
 
 
 @numba.njit(cache=True, nogil=True, fastmath=FAST)
-def sample_tile(tiles, tile, u, v):
+def sample_tile(tiles: ByteArray, tile: int, u: float, v: float) -> float:
     """Return the print of a tile at (u, v) in [0, 1]², bilinear, 0 (none) to 1; nothing outside."""
     size_v, size_u = tiles.shape[1], tiles.shape[2]
     x, y = u * size_u - 0.5, v * size_v - 0.5
@@ -107,11 +111,11 @@ def sample_tile(tiles, tile, u, v):
     a, b = x - i, y - j
     top = tiles[tile, j, i] + a * (np.float64(tiles[tile, j, i + 1]) - tiles[tile, j, i])
     bottom = tiles[tile, j + 1, i] + a * (np.float64(tiles[tile, j + 1, i + 1]) - tiles[tile, j + 1, i])
-    return (top + b * (bottom - top)) / 255.0
+    return float((top + b * (bottom - top)) / 255.0)
 
 
 @numba.njit(cache=True, nogil=True)
-def noise_field(table, points, cell, octaves, persistence):
+def noise_field(table: Float32Array, points: FloatArray, cell: float, octaves: int, persistence: float) -> FloatArray:
     """Return fractal noise at points (N, 3), for the relief of meshes."""
     out = np.empty(len(points))
     for n in range(len(points)):

@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterable
 from pathlib import Path
 from types import TracebackType
+from typing import Any
 
 import numpy as np
 from rosbags.interfaces import Connection
@@ -115,7 +116,7 @@ class BagWriter:
         message = types["diagnostic_msgs/msg/DiagnosticArray"](header=self._header(stamp_ns, CAMERA_FRAME), status=[entry])
         self._write("exposure", stamp_ns, message)
 
-    def _header(self, stamp_ns: int, frame_id: str) -> object:
+    def _header(self, stamp_ns: int, frame_id: str) -> Any:
         types = self._store.types
         stamp = types["builtin_interfaces/msg/Time"](sec=stamp_ns // NANOSECONDS, nanosec=stamp_ns % NANOSECONDS)
         return types["std_msgs/msg/Header"](stamp=stamp, frame_id=frame_id)

@@ -109,7 +109,8 @@ def test_surface_and_seen_points_agree(recording: Path) -> None:
     vertices = np.stack([surface["vertex"][axis] for axis in "xyz"], axis=1)
     assert len(surface["face"]) > 100_000
     seen = PlyData.read(recording / "seen.ply")["vertex"]
-    assert [prop.name for prop in seen.properties] == ["x", "y", "z", "red", "green", "blue", "albedo_red", "albedo_green", "albedo_blue"]
+    names = ["x", "y", "z", "red", "green", "blue", "albedo_red", "albedo_green", "albedo_blue"]
+    assert [prop.name for prop in seen.properties] == names
     points = np.stack([seen[axis] for axis in "xyz"], axis=1)
     assert len(points) > 500
     assert np.all((points > vertices.min(axis=0) - 1e-6) & (points < vertices.max(axis=0) + 1e-6))

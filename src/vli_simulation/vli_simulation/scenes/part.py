@@ -44,13 +44,30 @@ def make_part(seed: int) -> Scene:
 
 def _materials(rng: np.random.Generator) -> tuple[Material, ...]:
     cast = Material(
-        jitter((0.36, 0.36, 0.37), rng), jitter((0.29, 0.28, 0.27), rng), stain_cell=0.008, stain=0.45, grain_cell=0.9e-3, grain=0.085,
-        speck_density=0.16, speck=0.4, gloss=0.10, shininess=18,
-    )  # fmt: skip
+        jitter((0.36, 0.36, 0.37), rng),
+        jitter((0.29, 0.28, 0.27), rng),
+        stain_cell=0.008,
+        stain=0.45,
+        grain_cell=0.9e-3,
+        grain=0.085,
+        speck_density=0.16,
+        speck=0.4,
+        gloss=0.10,
+        shininess=18,
+    )
     machined = Material(
-        jitter((0.44, 0.44, 0.45), rng), jitter((0.38, 0.37, 0.36), rng), stain_cell=0.010, stain=0.35, grain_cell=0.5e-3, grain=0.045,
-        stretch=5.0, speck_density=0.06, speck=0.25, gloss=0.20, shininess=35,
-    )  # fmt: skip
+        jitter((0.44, 0.44, 0.45), rng),
+        jitter((0.38, 0.37, 0.36), rng),
+        stain_cell=0.010,
+        stain=0.35,
+        grain_cell=0.5e-3,
+        grain=0.045,
+        stretch=5.0,
+        speck_density=0.06,
+        speck=0.25,
+        gloss=0.20,
+        shininess=35,
+    )
     return cast, machined
 
 
@@ -88,12 +105,14 @@ class _Relief:
         return result
 
     def engrave(self, text: str, x: float, y: float, size: float) -> None:
-        """Engrave ``text`` in a square of ``size`` metres whose centre is (x, y), upright along −x for a camera that moves along x."""
+        """Engrave ``text`` in a square of ``size`` metres centred at (x, y), upright along −x."""
         tile = cv2.GaussianBlur(print_tile(text, 0.85, (0.06, 0.66)), (0, 0), 2.0)
         u = (self.y - y) / size + 0.5
         v = (self.x - x) / size + 0.5
         at = [(np.clip(a, -0.5, 1.5) * tile.shape[0]).astype(np.float32) for a in (u, v)]
-        cut = cv2.remap(tile.astype(np.float32) / 255, at[0], at[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+        cut = cv2.remap(
+            tile.astype(np.float32) / 255, at[0], at[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0
+        )
         self.height = self.height - _ENGRAVED * cut
 
 

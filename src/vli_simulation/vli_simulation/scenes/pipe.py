@@ -49,10 +49,28 @@ def _materials(rng: np.random.Generator) -> tuple[Material, ...]:
     rust = jitter((0.40, 0.21, 0.11), rng)
     return (
         Material(steel, rust, stain_cell=0.0065, stain=0.62, grain=0.17, speck_density=0.25, speck=0.5, gloss=0.05, shininess=25),
-        Material(jitter((0.42, 0.41, 0.42), rng), jitter((0.33, 0.27, 0.30), rng), stain_cell=0.002, stain=0.5, grain=0.11, gloss=0.2, shininess=40),
+        Material(
+            jitter((0.42, 0.41, 0.42), rng),
+            jitter((0.33, 0.27, 0.30), rng),
+            stain_cell=0.002,
+            stain=0.5,
+            grain=0.11,
+            gloss=0.2,
+            shininess=40,
+        ),
         Material(jitter((0.46, 0.45, 0.43), rng), rust, stain_cell=0.003, stain=0.32, grain=0.09, gloss=0.15, shininess=40),
         Material(jitter((0.38, 0.37, 0.36), rng), rust, stain_cell=0.002, stain=0.45, grain=0.10, gloss=0.10, shininess=30),
-        Material(steel, rust, ink=(0.62, 0.56, 0.22), stain_cell=0.0065, stain=0.62, grain=0.17, speck_density=0.25, speck=0.5, gloss=0.05),
+        Material(
+            steel,
+            rust,
+            ink=(0.62, 0.56, 0.22),
+            stain_cell=0.0065,
+            stain=0.62,
+            grain=0.17,
+            speck_density=0.25,
+            speck=0.5,
+            gloss=0.05,
+        ),
     )
 
 
@@ -71,13 +89,15 @@ class _Wall:
             height = np.maximum(height, _BEAD_HEIGHT * ripple * np.exp(-0.5 * ((x - bead + 2e-4 * ground) / _BEAD_SIGMA) ** 2))
         ripple = 1 + 0.14 * np.cos(2 * np.pi * (x + 4 * _RADIUS * np.abs(arc - self._seam)) / 1.9e-3) + 0.12 * ground
         seam = 0.8e-3 * ripple * np.exp(-0.5 * ((arc - self._seam) * _RADIUS / 1.4e-3) ** 2)
-        return np.maximum(height, seam)
+        result: FloatArray = np.maximum(height, seam)
+        return result
 
     def bright(self, x: FloatArray, arc: FloatArray) -> FloatArray:
         """Return 1 on the beads and where their heat has bared the metal, else 0; the border is ragged."""
         ragged = 0.35e-3 * self._noise(x + 0.3, arc, 0.0016, 2)
         across = np.minimum(np.abs(x[:, None] - self._beads).min(axis=1), np.abs(arc - self._seam) * _RADIUS + 0.5e-3)
-        return (across + ragged < 2.7e-3).astype(np.float64)
+        result: FloatArray = (across + ragged < 2.7e-3).astype(np.float64)
+        return result
 
     def height(self, x: FloatArray, arc: FloatArray) -> FloatArray:
         """Return the relief towards the axis, metres: out-of-round, corrosion, pits, welds."""
@@ -97,7 +117,7 @@ class _Wall:
         coarse = np.arange(_FINE_HALF_ARC, 2 * np.pi - _FINE_HALF_ARC, 0.05)
         gx, ga = np.meshgrid(x, np.concatenate([fine, coarse]), indexing="ij")
         flat_x, flat_arc = gx.ravel(), ga.ravel()
-        faces = grid_faces(*gx.shape, closed=True)[:, ::-1].copy()
+        faces = grid_faces(gx.shape[0], gx.shape[1], closed=True)[:, ::-1].copy()
         mesh = make_mesh(self.place(flat_x, flat_arc), faces, _RUST)
         mesh.material[self.bright(flat_x, flat_arc)[faces].mean(axis=1) > 0.5] = _WELD
         return mesh
@@ -116,10 +136,13 @@ def _bolt(wall: _Wall, x: float, arc: float, rng: np.random.Generator) -> Mesh:
     folded = np.mod(angle - turn, np.pi / 3) - np.pi / 6
     hexagon = circle / np.cos(folded)[:, None]
     washer = _rings(circle, ((5.6e-3, -1e-3), (5.6e-3, 0.8e-3), (5.3e-3, 1.05e-3), (3.0e-3, 1.05e-3)))
-    round_off = np.minimum(hexagon * 4.0e-3, 1e9)
+    round_off = hexagon * 4.0e-3
     trimmed = round_off * np.minimum(1.0, 4.35e-3 / np.linalg.norm(round_off, axis=1, keepdims=True))
     head = [np.column_stack([round_off, np.full(48, z)]) for z in (0.9e-3, 3.6e-3)]
-    head += [np.column_stack([trimmed * s, np.full(48, z)]) for s, z in ((0.985, 4.1e-3), (0.93, 4.35e-3), (0.7, 4.45e-3), (0.35, 4.42e-3))]
+    head += [
+        np.column_stack([trimmed * s, np.full(48, z)])
+        for s, z in ((0.985, 4.1e-3), (0.93, 4.35e-3), (0.7, 4.45e-3), (0.35, 4.42e-3))
+    ]
     parts = []
     for rings, top, material in ((washer, 1.05e-3, _WASHER), (head, 4.4e-3, _BOLT)):
         vertices, faces = loft(rings, np.array([0.0, 0.0, top]))
@@ -135,7 +158,8 @@ def _on_wall(vertices: FloatArray, x: float, arc: float) -> FloatArray:
     """Return local vertices (x along the pipe, y around, z towards the axis) in the pipe's frame."""
     axes = np.array([[1.0, 0.0, 0.0], [0.0, np.cos(arc), np.sin(arc)], [0.0, -np.sin(arc), np.cos(arc)]])
     origin = np.array([x, _RADIUS * np.sin(arc), -_RADIUS * np.cos(arc)])
-    return vertices @ axes + origin
+    result: FloatArray = vertices @ axes + origin
+    return result
 
 
 def _marks(wall: _Wall, beads: FloatArray, rng: np.random.Generator) -> tuple[list[Mesh], ByteArray]:

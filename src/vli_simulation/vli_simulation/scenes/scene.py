@@ -87,12 +87,16 @@ def print_tile(text: str, scale: float = 1.0, origin: tuple[float, float] = (0.1
     at = (round(origin[0] * TILE_PX), round(origin[1] * TILE_PX))
     cv2.putText(tile, text, at, cv2.FONT_HERSHEY_SIMPLEX, 2.6 * scale, 255, thickness, cv2.LINE_AA)
     if second:
-        cv2.putText(tile, second, (at[0], round(0.32 * TILE_PX)), cv2.FONT_HERSHEY_SIMPLEX, 1.7 * scale, 255, thickness - 1, cv2.LINE_AA)
+        cv2.putText(
+            tile, second, (at[0], round(0.32 * TILE_PX)), cv2.FONT_HERSHEY_SIMPLEX, 1.7 * scale, 255, thickness - 1, cv2.LINE_AA
+        )
     blurred: ByteArray = cv2.GaussianBlur(tile, (0, 0), 1.0).astype(np.uint8)
     return blurred
 
 
 def jitter(colour: tuple[float, float, float], rng: np.random.Generator, amount: float = 0.06) -> tuple[float, float, float]:
     """Return a colour that differs a little, as parts of one batch do."""
-    value: FloatArray = np.clip(np.array(colour) * (1 + amount * rng.standard_normal()) * (1 + 0.3 * amount * rng.standard_normal(3)), 0, 1)
+    value: FloatArray = np.clip(
+        np.array(colour) * (1 + amount * rng.standard_normal()) * (1 + 0.3 * amount * rng.standard_normal(3)), 0, 1
+    )
     return float(value[0]), float(value[1]), float(value[2])
