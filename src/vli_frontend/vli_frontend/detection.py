@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import cv2
 import numpy as np
 from numba import njit
@@ -11,23 +13,30 @@ from vli_frontend.config import DetectionConfig
 from vli_frontend.patch_alignment import MARGIN_PX
 
 _BLOCK = 3
+_NEIGHBOURS = np.ones((3, 3), np.uint8)
 _NOISE_RESPONSE = 2e-5
 """Corner response of sensor noise on an empty area (OpenCV's scale, half-size image): nothing below is a corner."""
 
 
 def detect(half: ByteArray, existing: FloatArray, count: int, config: DetectionConfig) -> FloatArray:
-    """Return up to ``count`` new corners (M, 2) in pixels, at least ``distance_px`` from each other and from ``existing`` (N, 2).
+    """Return new corners (M, 2), full-size pixels, at least ``distance_px`` from each other and from ``existing``.
 
-    The response (least eigenvalue of the structure tensor, Shi and Tomasi, 1994) is taken at half the size, which costs a tenth; each point
-    goes to the strongest corner left in the emptiest cell of a grid.
+    The response (least eigenvalue of the structure tensor, Shi and Tomasi, 1994) is taken at half the size, which costs a tenth;
+    the cells of a grid fill up evenly, each from its strongest corner down.
+
+    Args:
+        half: (H/2, W/2) uint8, see ``photometry.Frame``.
+        existing: (N, 2) pixels of the full size.
+        count: most points wanted.
+        config: quality, distance, grid.
     """
     if count <= 0:
         return np.empty((0, 2))
-    response = cv2.cornerMinEigenVal(half, _BLOCK)
+    response = cast(Float32Array, cv2.cornerMinEigenVal(half, _BLOCK))
     _clear_border(response, (MARGIN_PX + 2) // 2)
     peaks = _peaks(response, max(config.quality * float(response.max()), _NOISE_RESPONSE))
-    half = _choose(response, peaks, existing / 2, count, config.distance_px / 2, config.cells)
-    return 2.0 * half
+    chosen: FloatArray = _choose(response, peaks, existing / 2, count, config.distance_px / 2, config.cells)
+    return 2.0 * chosen
 
 
 def _clear_border(response: Float32Array, margin: int) -> None:
@@ -37,7 +46,7 @@ def _clear_border(response: Float32Array, margin: int) -> None:
 
 def _peaks(response: Float32Array, threshold: float) -> IntArray:
     """Return (M, 2) row and column of the local maxima above the threshold, strongest first."""
-    maximal = (response >= cv2.dilate(response, None)) & (response > threshold)
+    maximal = (response >= cv2.dilate(response, _NEIGHBOURS)) & (response > threshold)
     rows, columns = np.nonzero(maximal)
     order = np.argsort(-response[rows, columns], kind="stable")
     return np.stack([rows[order], columns[order]], axis=1).astype(np.int64)
@@ -78,7 +87,7 @@ def _cell(coordinate: float, size: float, cells: int) -> int:
 
 @njit(cache=True)
 def _is_clear(points: FloatArray, x: float, y: float, distance: float) -> bool:
+    nearest = np.inf
     for n in range(len(points)):
-        if (points[n, 0] - x) ** 2 + (points[n, 1] - y) ** 2 < distance * distance:
-            return False
-    return True
+        nearest = min(nearest, (points[n, 0] - x) ** 2 + (points[n, 1] - y) ** 2)
+    return nearest >= distance * distance

@@ -38,10 +38,12 @@ class FrontEnd:
         self._preintegrator = self._make_preintegrator() if mode.uses_imu else None
         self._tracker = Tracker(calibration.camera, config, self.counters)
         self._keyframes = KeyframeRule(config.keyframe, calibration.camera.focal_px)
-        # Long and short frames alternate: 1.5 frame periods reach the neighbour, and no further one even where the rhythm jitters.
+        # Long and short frames alternate: 1.5 frame periods reach the neighbour, and no farther one where the rhythm jitters.
         self._stripes = StripeDistance(round(1.5 * NANOSECONDS / calibration.rate_hz))
         self._session = 0
-        self._forget()
+        self._previous_ns: int | None = None
+        self._gyro_bias = np.zeros(3)
+        self._rotation_since_keyframe: FloatArray | None = None
 
     def reset(self, session: int) -> None:
         """Drop all state and begin another session."""
@@ -52,7 +54,7 @@ class FrontEnd:
         self._tracker.reset()
         self._keyframes.reset()
         self._stripes.clear()
-        self._forget()
+        self._previous_ns, self._gyro_bias, self._rotation_since_keyframe = None, np.zeros(3), None
 
     def set_bias(self, bias: ImuBias) -> None:
         """Predict with this gyro bias from now on, preintegrate with it from the next keyframe on."""
@@ -98,9 +100,11 @@ class FrontEnd:
         segment = self._segment(stamp_ns) if ready.covered else None
         rotation = self._rotation(segment)
         frame = make_frame(ready.image, self._config.klt.normalisation_px)
-        self._tracker.follow(frame, (stamp_ns - self._previous_ns) / NANOSECONDS, rotation)
+        self._tracker.follow(frame, (stamp_ns - (self._previous_ns or 0)) / NANOSECONDS, rotation)
         verdict = self._judge(stamp_ns, rotation, segment)
-        preintegration = self._preintegrator.to(stamp_ns, self._session) if self._preintegrator is not None and ready.covered else None
+        preintegration = None
+        if self._preintegrator is not None and ready.covered:
+            preintegration = self._preintegrator.to(stamp_ns, self._session)
         if verdict.keyframe:
             self._tracker.replenish(frame)
             self._begin_interval(stamp_ns, verdict.stationary)
@@ -109,7 +113,9 @@ class FrontEnd:
 
     def _segment(self, stamp_ns: int) -> ImuSegment | None:
         """Return the IMU since the frame before; for the first frame, that of one frame period."""
-        begin_ns = self._previous_ns if self._previous_ns >= 0 else stamp_ns - round(2 * NANOSECONDS / self._calibration.rate_hz)
+        begin_ns = self._previous_ns
+        if begin_ns is None:
+            begin_ns = stamp_ns - round(2 * NANOSECONDS / self._calibration.rate_hz)
         segment = self._synchroniser.segment(begin_ns, stamp_ns)
         if segment is None or segment.longest_gap_ns > seconds_to_ns(self._config.imu.interpolated_gap_s):
             return None
@@ -146,8 +152,19 @@ class FrontEnd:
         """Return the tracks as they are now; nothing in it changes later."""
         table = self._tracker.tracks
         stripe_px = self._stripes.measure(stamp_ns, table.pixels)
-        columns = (table.ids, table.pixels, table.rays, table.velocity, self._tracker.sigma_px, stripe_px, table.flags)
-        return Tracks(stamp_ns, verdict.keyframe, verdict.stationary, *(column.copy() for column in columns), session=self._session)
+        return Tracks(
+            stamp_ns,
+            verdict.keyframe,
+            verdict.stationary,
+            ids=table.ids.copy(),
+            pixels=table.pixels.copy(),
+            rays=table.rays.copy(),
+            velocity=table.velocity.copy(),
+            sigma_px=self._tracker.sigma_px,
+            stripe_px=stripe_px,
+            flags=table.flags.copy(),
+            session=self._session,
+        )
 
     def _make_preintegrator(self) -> Preintegrator:
         imu = self._calibration.imu
@@ -155,8 +172,3 @@ class FrontEnd:
             problem = f"mode '{self._mode.value}' needs imu0 and cam0.T_cam_imu; run 'vli calibrate imu-camera', or use --mode vl"
             raise CalibrationError("as given", [problem])
         return Preintegrator(imu, self._config.imu, self._synchroniser, self.counters)
-
-    def _forget(self) -> None:
-        self._previous_ns = -1
-        self._gyro_bias = np.zeros(3)
-        self._rotation_since_keyframe: FloatArray | None = np.eye(3)

@@ -12,7 +12,7 @@ from vli_frontend.synchroniser import seconds_to_ns
 
 _REFERENCE_FOCAL_PX = 460.0
 _COMMON_SHARE = 0.6
-"""Share of the keyframe's own tracks below which a new one is due where it had few: a poor scene is no reason for one each frame."""
+"""Share of the keyframe's own tracks below which a new one is due where it had few: a poor scene is no reason for one a frame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,7 +35,7 @@ class _Keyframe:
 class KeyframeRule:
     """Enough parallax since the last keyframe, too few tracks left, or time.
 
-    Parallax is the mean motion of the tracks in common with the rotation taken out; thresholds in pixels scale with the focal length.
+    Parallax is the mean motion of the tracks in common, with the rotation taken out.
 
     Args:
         config: thresholds.
@@ -53,7 +53,9 @@ class KeyframeRule:
         """Forget the last keyframe: the next frame is one."""
         self._last = None
 
-    def judge(self, stamp_ns: int, ids: IntArray, rays: FloatArray, rotation: FloatArray | None, mean_rate: FloatArray | None) -> FrameVerdict:
+    def judge(
+        self, stamp_ns: int, ids: IntArray, rays: FloatArray, rotation: FloatArray | None, mean_rate: FloatArray | None
+    ) -> FrameVerdict:
         """Judge one frame.
 
         Args:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import cv2
 import numpy as np
 
@@ -53,4 +55,4 @@ def _lucas_kanade(
         flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
     )
     ok: BoolArray = status.ravel().astype(np.bool_)
-    return found, ok
+    return cast(Float32Array, found), ok

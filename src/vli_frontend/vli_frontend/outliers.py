@@ -1,7 +1,7 @@
 """Rejection of tracks that do not fit the motion of the camera between two frames.
 
-With the rotation known from the gyroscope two points fix the direction of translation; a plane is no degenerate case then, and where nothing
-translates every direction fits, so nothing is rejected. Without it, the essential matrix.
+With the rotation known from the gyroscope two points fix the direction of translation; a plane is no degenerate case then, and
+where nothing translates every direction fits, so nothing is rejected. Without it, the essential matrix.
 """
 
 from __future__ import annotations
@@ -57,8 +57,17 @@ def _essential_inliers(previous: FloatArray, current: FloatArray, threshold: flo
 
 
 @njit(cache=True)
-def translation_inliers(previous: FloatArray, current: FloatArray, rotation: FloatArray, pairs: IntArray, threshold: float) -> BoolArray:
-    """Return (N,) True within ``threshold`` of the epipolar line of the best translation; hypotheses are pairs (M, 2) of indices."""
+def translation_inliers(
+    previous: FloatArray, current: FloatArray, rotation: FloatArray, pairs: IntArray, threshold: float
+) -> BoolArray:
+    """Return (N,) True within ``threshold`` of the epipolar line of the best translation.
+
+    Args:
+        previous, current: rays (N, 2).
+        rotation: (3, 3), previous camera → current one.
+        pairs: (M, 2) indices, two points a hypothesis; scored by the truncated quadratic (MSAC, Torr and Zisserman, 2000).
+        threshold: normalised image plane.
+    """
     turned = np.empty((len(previous), 3))
     for n in range(len(previous)):
         for i in range(3):

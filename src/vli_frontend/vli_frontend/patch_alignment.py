@@ -4,8 +4,9 @@ Inverse-compositional (Baker and Matthews, 2004). The image under the warp is mo
 
     I(W(x)) = g T(Δ(x)) + b + (s_u u + s_v v) T(x),   Δ(x) = x + t + M (u, v)
 
-with u, v the offsets over the half width, which is linear in (g t, g M, g, b, s): the rows gx, gy, gx·u, gx·v, gy·u, gy·v, T − mean(T), 1,
-u·T, v·T, their weighted normal matrix and its inverse are fixed at birth. Without the slope of the gain an on-board light leaves twice the drift.
+with u, v the offsets over the half width, which is linear in (g t, g M, g, b, s): the rows gx, gy, gx·u, gx·v, gy·u, gy·v,
+T − mean(T), 1, u·T, v·T, their weighted normal matrix and its inverse are fixed at birth. Without the slope of the gain an
+on-board light leaves twice the drift.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ class PatchTemplates:
         self.valid = np.zeros(capacity, np.bool_)
         """(capacity,): False where the texture determines no position."""
         self.sigma_per_level = np.full(capacity, np.inf)
-        """(capacity,): standard deviation of the position per axis, in pixels for one grey level of white noise (Cramér–Rao bound)."""
+        """(capacity,): of the position per axis, pixels for one grey level of white noise (Cramér–Rao bound)."""
 
     def create(self, grey: ByteArray, slots: IntArray, pixels: FloatArray) -> None:
         """Take new patches around ``pixels`` (N, 2) into ``slots`` (N,); all at least :data:`MARGIN_PX` inside the image."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import cast
 
 import cv2
 import numpy as np
@@ -42,15 +43,15 @@ def make_frame(image: Image, window_px: int) -> Frame:
     """Return the versions of an image; ``window_px`` of the full size, below 3 nothing is normalised."""
     grey = cv2.cvtColor(image.pixels, cv2.COLOR_BGR2GRAY) if image.is_colour else np.ascontiguousarray(image.pixels)
     grey = cv2.GaussianBlur(grey, (3, 3), 0)
-    half = cv2.pyrDown(grey)
-    return Frame(grey, half, half if window_px < 3 else normalise_locally(half, 2 * (window_px // 4) + 1))
+    half = cast(ByteArray, cv2.pyrDown(grey))
+    return Frame(cast(ByteArray, grey), half, half if window_px < 3 else normalise_locally(half, 2 * (window_px // 4) + 1))
 
 
 def normalise_locally(grey: ByteArray, window_px: int) -> ByteArray:
     """Return (grey − mean) / std over an odd window as 8 bit, same shape (H, W); beyond the border the image is mirrored."""
     window = (window_px, window_px)
-    mean = cv2.boxFilter(grey, cv2.CV_32F, window)
-    square = cv2.sqrBoxFilter(grey, cv2.CV_32F, window)
+    mean = cast(Float32Array, cv2.boxFilter(grey, cv2.CV_32F, window))
+    square = cast(Float32Array, cv2.sqrBoxFilter(grey, cv2.CV_32F, window))
     out = np.empty_like(grey)
     _standardise(grey, mean, square, out)
     return out
@@ -62,5 +63,7 @@ def _standardise(grey: ByteArray, mean: Float32Array, square: Float32Array, out:
     for y in range(height):
         for x in range(width):
             variance = max(square[y, x] - mean[y, x] * mean[y, x], np.float32(0.0)) + np.float32(_NOISE_VARIANCE)
-            value = (np.float32(grey[y, x]) - mean[y, x]) * (np.float32(_GREY_PER_SIGMA) / math.sqrt(variance)) + np.float32(128.5)
+            value = (np.float32(grey[y, x]) - mean[y, x]) * (np.float32(_GREY_PER_SIGMA) / math.sqrt(variance)) + np.float32(
+                128.5
+            )
             out[y, x] = np.uint8(np.int32(min(max(value, np.float32(0.0)), np.float32(255.0))))

@@ -31,8 +31,8 @@ def combined_params(imu: ImuCalibration, config: ImuConfig) -> gtsam.Preintegrat
 class Preintegrator:
     """Measurements between the last keyframe and each frame after it.
 
-    Samples are instants: each step takes the mean of its two ends, the first and the last step end at the frames' own stamps. Every answer is
-    integrated afresh (1.5 µs a sample), so that it may be kept.
+    Samples are instants: each step takes the mean of its two ends, the first and the last step end at the frames' own stamps.
+    Every answer is integrated afresh (1.5 µs a sample), so that it may be kept.
 
     Args:
         imu: noise of the calibration.

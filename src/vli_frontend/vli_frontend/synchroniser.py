@@ -110,8 +110,9 @@ class ReadyFrame:
 class Synchroniser:
     """Holds long frames until the IMU covers them; keeps both in strict order.
 
-    What is out of order, duplicated or not finite is dropped and counted. A frame waits at most ``max_wait_ns`` of data time (of IMU or of later
-    frames): then it goes on without the IMU, so that a dead IMU does not stop the camera, and no result depends on what comes later.
+    What is out of order, duplicated or not finite is dropped and counted. A frame waits at most ``max_wait_ns`` of data time (of
+    IMU or of later frames): then it goes on without the IMU, so that a dead IMU does not stop the camera, and no result depends
+    on what comes later.
 
     Args:
         timeshift_ns: ``t_imu = t_cam + timeshift``.

@@ -1,4 +1,4 @@
-"""Feature tracks through the long frames: predict, follow, align to the patch seen at birth, reject outliers, replenish (notes in klt and patch_alignment)."""
+"""Feature tracks through the long frames: predict, follow, align to the patch seen at birth, reject outliers, replenish."""
 
 from __future__ import annotations
 
@@ -82,7 +82,8 @@ class Tracker:
 
     def reset(self) -> None:
         """Forget all tracks; ids start at 1 again."""
-        self.tracks = TrackTable.new(np.empty(0, np.int64), np.empty((0, 2)), np.empty((0, 2)), np.empty(0, np.int64), np.zeros(2))
+        none, nowhere = np.empty(0, np.int64), np.empty((0, 2))
+        self.tracks = TrackTable.new(none, nowhere, nowhere, none, np.zeros(2))
         self._previous: Frame | None = None
         self._next_id = 1
         self._outliers.reset()
@@ -91,7 +92,8 @@ class Tracker:
     def sigma_px(self) -> FloatArray:
         """Standard deviation (N,) of each position per axis: that of the texture, growing with the age of the patch."""
         config = self._config
-        return np.hypot(config.sigma_px, config.sigma_growth_px * self.tracks.age)
+        result: FloatArray = np.hypot(config.sigma_px, config.sigma_growth_px * self.tracks.age)
+        return result
 
     def follow(self, frame: Frame, dt_s: float, rotation: FloatArray | None) -> None:
         """Find the tracks in the next frame and drop those that are lost or do not fit.
@@ -141,7 +143,7 @@ class Tracker:
     def _inside(self, pixels: FloatArray) -> BoolArray:
         """Return (N,) True where a whole patch fits into the image."""
         limit = [self._camera.width - 1 - MARGIN_PX, self._camera.height - 1 - MARGIN_PX]
-        result: BoolArray = ((pixels >= MARGIN_PX) & (pixels <= limit)).all(axis=1)
+        result: BoolArray = np.all((pixels >= MARGIN_PX) & (pixels <= limit), axis=1)
         return result
 
     def _align(self, grey: ByteArray) -> None:
@@ -149,7 +151,8 @@ class Tracker:
         tracks, klt = self.tracks, self._config.klt
         aligned = self._templates.align(grey, tracks.slots, tracks.pixels, tracks.affine)
         moved = np.hypot(*(aligned.pixels - tracks.pixels).T)
-        good = aligned.converged & (aligned.correlation >= klt.min_correlation) & (moved <= klt.max_correction_px) & self._inside(aligned.pixels)
+        good = aligned.converged & (aligned.correlation >= klt.min_correlation) & (moved <= klt.max_correction_px)
+        good &= self._inside(aligned.pixels)
         tracks.pixels = np.where(good[:, None], aligned.pixels, tracks.pixels)
         tracks.affine = np.where(good[:, None, None], aligned.affine, np.eye(2))
         tracks.age[~good] = 0
