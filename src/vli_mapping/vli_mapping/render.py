@@ -1,8 +1,9 @@
 """A picture of a cloud without a display: point splats with a depth buffer, eye-dome lighting, three views on one sheet.
 
-Each point is a disc as wide as the points are apart, so that surfaces close and edges stay sharp. Shading is by the change of depth
-around a pixel (eye-dome lighting: Boucheny, "Visualisation scientifique de grands volumes de données", 2009) and gently by the normal;
-colours are those of the map.
+Each point is a disc wider than the points are apart; the discs that lie in front at a pixel are blended, so that surfaces close and are
+smooth, and edges stay sharp (after Botsch et al., "High-quality surface splatting on today's GPUs", 2005). Shading is by the change of
+depth around a pixel (eye-dome lighting: Boucheny, "Visualisation scientifique de grands volumes de données", 2009) and gently by the
+normal; colours are those of the map.
 """
 
 from __future__ import annotations
@@ -29,9 +30,9 @@ _TEXT = (225, 225, 225)
 _FAINT = (150, 150, 150)
 _MAX_POINTS = 3_000_000
 _MIN_SPLAT, _MAX_SPLAT = 0.8, 24.0
-_EDL_STRENGTH = 0.35
+_EDL_STRENGTH = 1.2
 _EDL_RADII = 1, 2, 4
-_TARGET_BRIGHTNESS = 0.72
+_TARGET_BRIGHTNESS = 0.85
 """Of the 90th percentile of brightness: a scan under on-board light is dark."""
 
 
@@ -75,7 +76,7 @@ def draw_views(cloud: PointCloud, size: tuple[int, int] = SHEET) -> ByteArray:
     for (x, y, w, h), view in zip(_panels(width, height), _views(points, frame, spacing, width, height), strict=True):
         panel = sheet[y : y + h, x : x + w]
         panel[:] = draw(points, colours, normals, view, spacing, panel)
-        _label(panel, view)
+        _label(sheet[y - _TITLE : y, x : x + w], view)
     _text(sheet, f"{len(cloud):,} points".replace(",", " "), (_MARGIN, height - 14), 0.5, _FAINT)
     return sheet
 
@@ -96,11 +97,14 @@ def draw(
     height, width = background.shape[0] * _SUPERSAMPLE, background.shape[1] * _SUPERSAMPLE
     pixel = view.metres_per_pixel / _SUPERSAMPLE
     local = (points - view.centre) @ view.axes.T / pixel
-    splat = float(np.clip(0.75 * spacing / pixel, _MIN_SPLAT, _MAX_SPLAT))
-    depth, index = np.full((height, width), -np.inf, np.float32), np.full((height, width), -1, np.int32)
-    _splat(local, splat, depth, index)
-    seen = index >= 0
-    canvas = _shade(colours, normals, view, index) * _eye_dome(depth, seen, splat)[..., None]
+    splat = float(np.clip(spacing / pixel, _MIN_SPLAT, _MAX_SPLAT))
+    lit = _lit(colours, normals, view)
+    depth, blend = np.full((height, width), -np.inf, np.float32), np.zeros((height, width, 5), np.float32)
+    _front(local, splat, depth)
+    _blend(local, splat, max(2 * spacing / pixel, 2.0), depth, lit, blend)
+    seen = blend[..., 4] > 0
+    mean = blend[..., :4] / np.where(seen, blend[..., 4], 1.0)[..., None]
+    canvas = mean[..., :3] * _eye_dome(mean[..., 3], seen, splat)[..., None]
     big = cv2.resize(background, (width, height), interpolation=cv2.INTER_LINEAR).astype(np.float32) / 255
     canvas = np.where(seen[..., None], canvas, big)
     small = cv2.resize(canvas, (background.shape[1], background.shape[0]), interpolation=cv2.INTER_AREA)
@@ -133,26 +137,26 @@ def principal_axes(points: FloatArray, normals: Float32Array) -> FloatArray:
 
 
 def _panels(width: int, height: int) -> list[tuple[int, int, int, int]]:
-    """Return x, y, width, height of the panels: a wide one above, two below."""
-    inner = width - 2 * _MARGIN
-    top = (height - 3 * _MARGIN) * 2 // 5
-    low = height - 3 * _MARGIN - top
-    half = (inner - _MARGIN) // 2
+    """Return x, y, width, height of the panels, each under a strip for its title: two at the left, a tall one at the right."""
+    left = (width - 3 * _MARGIN) * 11 // 20
+    right = width - 3 * _MARGIN - left
+    upper = (height - 2 * _MARGIN - 2 * _TITLE) * 11 // 20
+    lower = height - 2 * _MARGIN - 2 * _TITLE - upper
     return [
-        (_MARGIN, _MARGIN, inner, top),
-        (_MARGIN, 2 * _MARGIN + top, half, low),
-        (width - _MARGIN - half, 2 * _MARGIN + top, half, low),
+        (_MARGIN, _MARGIN + _TITLE, left, upper),
+        (_MARGIN, _MARGIN + 2 * _TITLE + upper, left, lower),
+        (2 * _MARGIN + left, _MARGIN + _TITLE, right, height - 2 * _MARGIN - _TITLE),
     ]
 
 
 def _views(points: FloatArray, frame: FloatArray, spacing: float, width: int, height: int) -> list[View]:
     panels = _panels(width, height)
-    oblique, close = _turned(frame, 28.0, 52.0), _turned(frame, -32.0, 50.0)
+    oblique, close = _turned(frame, 18.0, 44.0), _turned(frame, -32.0, 46.0)
     focus = _busiest(points, frame)
     near = points[np.linalg.norm((points - focus) @ frame[:2].T, axis=1) < _close_radius(points, frame)]
     return [
-        _fit("from above", points, frame, panels[0]),
-        _fit("oblique", points, oblique, panels[1]),
+        _fit("oblique", points, oblique, panels[0]),
+        _fit("from above", points, frame, panels[1]),
         _fit("close up", near if len(near) else points, close, panels[2], fill=1.25),
     ]
 
@@ -171,7 +175,7 @@ def _fit(title: str, points: FloatArray, axes: FloatArray, panel: tuple[int, int
     local = points @ axes.T
     low, high = np.percentile(local, [0.1, 99.9], axis=0)
     _, _, width, height = panel
-    room = np.array([width, height - _TITLE]) * fill
+    room = np.array([width, height]) * fill
     scale = float(max(((high - low)[:2] / room).max(), 1e-9))
     return View(title, axes, (low + high) / 2 @ axes, scale)
 
@@ -217,13 +221,13 @@ def _exposed(colours: ByteArray) -> Float32Array:
     return result
 
 
-def _shade(colours: Float32Array, normals: Float32Array, view: View, index: Int32Array) -> Float32Array:
-    """Return the colour (H, W, 3) of the point in front at each pixel, a little darker where its surface turns away."""
-    light = view.axes.T @ (np.array([-0.35, 0.45, 1.0]) / np.linalg.norm([0.35, 0.45, 1.0]))
-    known = normals.any(axis=1)
-    facing = np.where(known, 0.5 + 0.5 * (normals @ light.astype(np.float32)), 0.85)
-    lit = colours * (0.62 + 0.42 * facing)[:, None].astype(np.float32)
-    return np.ascontiguousarray(lit[np.maximum(index, 0)])
+def _lit(colours: Float32Array, normals: Float32Array, view: View) -> Float32Array:
+    """Return colours (N, 3), a little darker where the surface turns away from a lamp above the viewer's left shoulder."""
+    lamp = np.array([-0.35, 0.45, 1.0])
+    light = (lamp / np.linalg.norm(lamp)) @ view.axes
+    facing = np.where(normals.any(axis=1), 0.5 + 0.5 * (normals @ light), 0.85)
+    result: Float32Array = colours * (0.5 + 0.5 * facing)[:, None].astype(np.float32)
+    return result
 
 
 def _eye_dome(depth: Float32Array, seen: BoolArray, splat: float) -> Float32Array:
@@ -236,7 +240,7 @@ def _eye_dome(depth: Float32Array, seen: BoolArray, splat: float) -> Float32Arra
             moved = np.roll(filled, (dy, dx), axis=(0, 1))
             ahead = np.where(moved > -1e8, moved - filled, 0.0)
             total += np.clip(ahead / (step * 2.0), 0.0, 2.0) / (4 * len(_EDL_RADII))
-    result: Float32Array = np.exp(-_EDL_STRENGTH * 6 * total).astype(np.float32)
+    result: Float32Array = np.exp(-_EDL_STRENGTH * total).astype(np.float32)
     return result
 
 
@@ -246,18 +250,18 @@ def _background(width: int, height: int) -> ByteArray:
     return np.broadcast_to(rows, (height, width, 3)).round().astype(np.uint8)
 
 
-def _label(panel: ByteArray, view: View) -> None:
+def _label(strip: ByteArray, view: View) -> None:
     """Write the title, and a scale bar of a round length."""
-    _text(panel, view.title, (4, 22), 0.6, _TEXT)
-    room = 0.22 * panel.shape[1] * view.metres_per_pixel
+    _text(strip, view.title, (4, 22), 0.6, _TEXT)
+    room = 0.22 * strip.shape[1] * view.metres_per_pixel
     power = 10.0 ** np.floor(np.log10(room))
     length = max(step * power for step in (1, 2, 5) if step * power <= room)
     pixels = round(length / view.metres_per_pixel)
-    right, base = panel.shape[1] - 8, 26
-    cv2.line(panel, (right - pixels, base), (right, base), _TEXT, 2, cv2.LINE_AA)
+    right, base = strip.shape[1] - 8, 26
+    cv2.line(strip, (right - pixels, base), (right, base), _TEXT, 2, cv2.LINE_AA)
     for x in (right - pixels, right):
-        cv2.line(panel, (x, base - 5), (x, base + 5), _TEXT, 2, cv2.LINE_AA)
-    _text(panel, f"{1e3 * length:g} mm", (right - pixels, 16), 0.5, _TEXT)
+        cv2.line(strip, (x, base - 5), (x, base + 5), _TEXT, 2, cv2.LINE_AA)
+    _text(strip, f"{1e3 * length:g} mm", (right - pixels, 16), 0.5, _TEXT)
 
 
 def _text(image: ByteArray, text: str, at: tuple[int, int], size: float, colour: tuple[int, int, int]) -> None:
@@ -265,20 +269,35 @@ def _text(image: ByteArray, text: str, at: tuple[int, int], size: float, colour:
 
 
 @njit(cache=True)
-def _splat(local, radius, depth, index):  # type: ignore[no-untyped-def]
-    """Draw discs at local (N, 3): x right, y up, from the middle, z towards the viewer, all in pixels; the nearest wins."""
+def _front(local, radius, depth):  # type: ignore[no-untyped-def]
+    """Write the nearest depth at each pixel of discs at local (N, 3): x right, y up from the middle, z towards the viewer, in pixels."""
     height, width = depth.shape
     reach = int(np.ceil(radius))
     for number in range(len(local)):
-        x = local[number, 0] + width / 2
-        y = height / 2 - local[number, 1]
-        z = local[number, 2]
+        x, y, z = local[number, 0] + width / 2, height / 2 - local[number, 1], local[number, 2]
         column, row = int(np.floor(x)), int(np.floor(y))
         for v in range(max(row - reach, 0), min(row + reach + 1, height)):
             for u in range(max(column - reach, 0), min(column + reach + 1, width)):
-                distance = (u + 0.5 - x) ** 2 + (v + 0.5 - y) ** 2
-                # A disc bulges a little towards the viewer, so that between two points each pixel shows the nearer one.
-                height_here = z - distance / (2 * radius + 1e-9)
-                if (distance <= radius * radius or (u == column and v == row)) and height_here > depth[v, u]:
-                    depth[v, u] = height_here
-                    index[v, u] = number
+                inside = (u + 0.5 - x) ** 2 + (v + 0.5 - y) ** 2 <= radius * radius
+                if (inside or (u == column and v == row)) and z > depth[v, u]:
+                    depth[v, u] = z
+
+
+@njit(cache=True)
+def _blend(local, radius, thickness, depth, colours, blend):  # type: ignore[no-untyped-def]
+    """Add colour, depth and weight (H, W, 5) of the discs within ``thickness`` of the front, heavier towards their middle."""
+    height, width = depth.shape
+    reach = int(np.ceil(radius))
+    for number in range(len(local)):
+        x, y, z = local[number, 0] + width / 2, height / 2 - local[number, 1], local[number, 2]
+        column, row = int(np.floor(x)), int(np.floor(y))
+        for v in range(max(row - reach, 0), min(row + reach + 1, height)):
+            for u in range(max(column - reach, 0), min(column + reach + 1, width)):
+                squared = ((u + 0.5 - x) ** 2 + (v + 0.5 - y) ** 2) / (radius * radius)
+                if z < depth[v, u] - thickness or (squared > 1 and not (u == column and v == row)):
+                    continue
+                weight = np.exp(-7.0 * squared)
+                for channel in range(3):
+                    blend[v, u, channel] += weight * colours[number, channel]
+                blend[v, u, 3] += weight * z
+                blend[v, u, 4] += weight
