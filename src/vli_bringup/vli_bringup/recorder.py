@@ -12,7 +12,7 @@ from vli_bringup.stamps import seconds_text
 from vli_common.arrays import FloatArray
 from vli_common.calibration import Calibration
 from vli_common.geometry import inverse, quaternion_from_rotation
-from vli_common.types import NANOSECONDS, BackEndOutput, FrameKind, WindowPoses
+from vli_common.types import NANOSECONDS, BackEndOutput, FrameKind, TrackingState, WindowPoses
 
 
 class Recorder:
@@ -54,12 +54,20 @@ class Recorder:
         (directory / "trajectory.tum").write_text(tum_text(self.live))
         (directory / "trajectory_final.tum").write_text(tum_text(final))
 
+    def add_pose(self, stamp_ns: int, T_map_imu: FloatArray) -> None:
+        """Take the pose of one long frame, as published."""
+        self.live[stamp_ns] = T_map_imu @ self._T_imu_camera
+
+    def add_state(self, stamp_ns: int, state: TrackingState, reason: str) -> None:
+        """Take what the back end says of a frame; the states keep its changes only."""
+        self.reason = reason
+        if not self.states or state.value != self.states[-1][1]:
+            self.states.append((stamp_ns / NANOSECONDS, state.value, reason))
+
     def _add_output(self, output: BackEndOutput) -> None:
         if output.pose is not None and output.state.has_pose:
-            self.live[output.stamp_ns] = output.pose.T_map_imu @ self._T_imu_camera
-        self.reason = output.reason
-        if not self.states or output.state.value != self.states[-1][1]:
-            self.states.append((output.stamp_ns / NANOSECONDS, output.state.value, output.reason))
+            self.add_pose(output.stamp_ns, output.pose.T_map_imu)
+        self.add_state(output.stamp_ns, output.state, output.reason)
 
     def _add_window(self, window: WindowPoses) -> None:
         self._keyframes.update(window.stamps[window.kinds == FrameKind.KEYFRAME.value].tolist())

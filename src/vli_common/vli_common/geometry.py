@@ -84,6 +84,12 @@ def transform(T: FloatArray, points: FloatArray) -> FloatArray:
     return result
 
 
+def orthonormalised(T: FloatArray) -> FloatArray:
+    """Return a pose (4, 4) with its rotation brought back to SO(3); for poses that are chained, where rounding errors grow."""
+    u, _, vt = np.linalg.svd(T[:3, :3])
+    return pose(u @ vt, T[:3, 3])
+
+
 def interpolate(T0: FloatArray, T1: FloatArray, alpha: FloatArray | float) -> FloatArray:
     """Return poses between (and slightly beyond) two: R₀ Exp(α Log(R₀ᵀR₁)), (1−α) t₀ + α t₁.
 

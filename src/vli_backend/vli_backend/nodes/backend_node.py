@@ -111,6 +111,7 @@ class BackEndNode(VliNode):
 
     def on_finish(self) -> None:
         """Hand over everything still in the window as final."""
+        self._feed(self._pairing.flush())
         self._send_window(self.back_end.flush())
 
     def stage_counters(self) -> Counters:
@@ -130,26 +131,31 @@ class BackEndNode(VliNode):
         return self.existing(self._back_end)
 
     def _on_scan(self, scan: LaserScan) -> None:
-        self.back_end.add_scan(scan)
+        self._feed(self._pairing.add_scan(scan))
 
     def _on_constraints(self, constraints: MapConstraints) -> None:
         self.back_end.add_constraints(constraints)
 
     def _on_preintegration(self, preintegration: Preintegration | NoPreintegration) -> None:
-        self._estimate(self._pairing.add_preintegration(preintegration))
+        self._feed(self._pairing.add_preintegration(preintegration))
 
     def _on_tracks(self, tracks: Tracks) -> None:
-        self._estimate(self._pairing.add_tracks(tracks))
+        self._feed(self._pairing.add_tracks(tracks))
 
-    def _estimate(self, frames: list[FrontEndOutput]) -> None:
-        for frame in frames:
-            output = self.back_end.add_frame(frame)
-            if output.pose is not None and output.state.has_pose:
-                self._send_pose(output.pose)
-            self._send_window(output.window)
-            if output.bias is not None:
-                self.send(BIAS, bias_to_message(output.bias))
-            self._note(output)
+    def _feed(self, items: list[LaserScan | FrontEndOutput]) -> None:
+        for item in items:
+            if isinstance(item, LaserScan):
+                self.back_end.add_scan(item)
+            else:
+                self._publish(self.back_end.add_frame(item))
+
+    def _publish(self, output: BackEndOutput) -> None:
+        if output.pose is not None and output.state.has_pose:
+            self._send_pose(output.pose)
+        self._send_window(output.window)
+        if output.bias is not None:
+            self.send(BIAS, bias_to_message(output.bias))
+        self._note(output)
 
     def _note(self, output: BackEndOutput) -> None:
         """Tell a change of the tracking state at once."""

@@ -37,7 +37,7 @@ _STATUS_PERIOD_S = 1.0
 _FINISH_PERIOD_S = 0.1
 _QUIET_S = 1.0
 """An input that fell short of what its source sent is given up after this long without a message."""
-_QUEUE_DEPTHS = 6
+_QUEUE_DEPTHS = 12
 """The worker's queue holds this many times the depth of the topic."""
 _STOP_S = 2.0
 _CALL_S = 10.0
@@ -154,7 +154,7 @@ class VliNode(Node):
             entry.last_s = time.monotonic()
             self._worker.put(topic.name, partial(self._process, entry, read, handle, message, entry.last_s), limit)
 
-        entry.subscription = self.create_subscription(message_type(topic), entry.name, callback, quality(topic))
+        entry.subscription = self.create_subscription(message_type(topic), entry.name, callback, quality(topic, reading=True))
         self._inputs[topic.name] = entry
 
     def advertise(self, topic: Topic, name: str | None = None) -> Publisher:
@@ -261,7 +261,7 @@ class VliNode(Node):
         for topic in (STATUS, DIAGNOSTICS, SESSION):
             self.advertise(topic)
         self.create_subscription(Header, SESSION.name, self._on_session_message, quality(SESSION))
-        self.create_subscription(message_type(STATUS), STATUS.name, self._on_status, quality(STATUS))
+        self.create_subscription(message_type(STATUS), STATUS.name, self._on_status, quality(STATUS, reading=True))
         self.create_subscription(String, CALIBRATION.name, self._on_calibration, quality(CALIBRATION))
         self.create_timer(_STATUS_PERIOD_S, self.publish_status)
         self.create_timer(_FINISH_PERIOD_S, self._check_finish)

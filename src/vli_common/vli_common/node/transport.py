@@ -12,6 +12,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from vli_common.topics import Topic
 
 _PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
+_READER_FACTOR = 8
 LOCAL_PROFILE = Path(__file__).with_name("fastdds_local.xml")
 NETWORK_PROFILE = Path(__file__).with_name("fastdds_network.xml")
 
@@ -22,10 +23,17 @@ def set_transport_profile(profile: Path = LOCAL_PROFILE) -> None:
         os.environ[_PROFILE_VARIABLES[0]] = str(profile)
 
 
-def quality(topic: Topic) -> QoSProfile:
-    """Return the quality of service of a topic: always RELIABLE, as a best-effort publisher never reaches a reliable reader."""
+def quality(topic: Topic, reading: bool = False) -> QoSProfile:
+    """Return the quality of service of a topic: always RELIABLE, as a best-effort publisher never reaches a reliable reader.
+
+    Args:
+        topic: of the table, whose depth is the publisher's.
+        reading: True for a subscriber: it keeps more, since a callback may wait for the interpreter while a kernel runs, and a
+            full reader loses even RELIABLE messages.
+    """
+    keeps_more = reading and not topic.transient_local
     return QoSProfile(
-        depth=topic.depth,
+        depth=topic.depth * (_READER_FACTOR if keeps_more else 1),
         history=HistoryPolicy.KEEP_LAST,
         reliability=ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if topic.transient_local else DurabilityPolicy.VOLATILE,

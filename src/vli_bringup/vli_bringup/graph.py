@@ -1,0 +1,77 @@
+"""The node graph, described once: `vli replay` and the launch files start the same processes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from vli_common.types import Mode
+
+
+@dataclass(frozen=True, slots=True)
+class NodeDescription:
+    """One process of the graph; ``parameters`` are those beyond the parameter file."""
+
+    package: str
+    executable: str
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def module(self) -> str:
+        """Python module of the executable."""
+        return f"{self.package}.nodes.{self.executable}"
+
+
+@dataclass(frozen=True, slots=True)
+class Playback:
+    """Which part of a bag the driver plays, and how fast."""
+
+    bag: Path
+    rate: float = 1.0
+    start_s: float = 0.0
+    duration_s: float | None = None
+
+
+SCANNER = "driver_node"
+STAGES = (
+    ("vli_driver", "demux_node"),
+    ("vli_frontend", "frontend_node"),
+    ("vli_backend", "backend_node"),
+    ("vli_mapping", "mapping_node"),
+)
+"""Package and executable of every node behind the source, in the order of the data."""
+
+
+def describe_graph(
+    calibration: Path,
+    mode: Mode = Mode.VLI_SLAM,
+    imu_calibration: Path | None = None,
+    playback: Playback | None = None,
+    save_path: Path | None = None,
+) -> list[NodeDescription]:
+    """Return every node of the graph.
+
+    Args:
+        calibration: file that the driver publishes for all.
+        mode: which sensors take part.
+        imu_calibration: Kalibr's separate IMU file.
+        playback: the bag to play; None for a graph that waits for a camera and an IMU.
+        save_path: where mapping saves the map.
+    """
+    shared: dict[str, Any] = {"mode": mode.value}
+    source = {**shared, "calibration_file": str(calibration.absolute())}
+    if imu_calibration is not None:
+        source["imu_calibration_file"] = str(imu_calibration.absolute())
+    if playback is not None:
+        source |= {
+            "bag": str(playback.bag.absolute()),
+            "rate": playback.rate,
+            "start": playback.start_s,
+            "duration": playback.duration_s or 0.0,
+            "wait_for": ",".join(executable for _, executable in STAGES),
+        }
+    own = {"mapping_node": {"save_path": str(save_path.absolute())}} if save_path is not None else {}
+    nodes = [NodeDescription("vli_driver", SCANNER, source)]
+    return nodes + [NodeDescription(package, name, {**shared, **own.get(name, {})}) for package, name in STAGES]

@@ -1,0 +1,118 @@
+"""The graph as seen from outside: poses, windows, states and the status of every node, by their topics."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from std_srvs.srv import Trigger
+
+from vli_bringup.processes import GraphError
+from vli_bringup.recorder import Recorder
+from vli_common.messages import pose_from_message, status_from_message, window_from_message
+from vli_common.node.transport import message_type, quality, set_transport_profile
+from vli_common.status import NodeState, StageStatus
+from vli_common.topics import BIAS, NAMESPACE, POSE, STATUS, WINDOW, Topic
+from vli_common.types import TrackingState
+
+_SPIN_S = 0.1
+_BACK_END = "backend_node"
+
+
+class GraphListener:
+    """Collects what the nodes publish into a :class:`Recorder`; use as a context manager.
+
+    Args:
+        recorder: gets poses, windows and states.
+    """
+
+    def __init__(self, recorder: Recorder) -> None:
+        self.statuses: dict[str, StageStatus] = {}
+        """The newest status of each node."""
+        self._recorder = recorder
+
+    def __enter__(self) -> GraphListener:
+        """Join the graph."""
+        set_transport_profile()
+        rclpy.init(signal_handler_options=rclpy.SignalHandlerOptions.NO)
+        self._node = rclpy.create_node("replay", namespace=NAMESPACE)
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self._node)
+        self._subscribe(POSE, lambda message: self._recorder.add_pose(*pose_from_message(message)))
+        self._subscribe(WINDOW, lambda message: self._recorder.add([window_from_message(message)]))
+        self._subscribe(STATUS, self._on_status)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Leave the graph."""
+        self._executor.shutdown()
+        self._node.destroy_node()
+        rclpy.try_shutdown()
+
+    def spin(self) -> None:
+        """Handle what comes within a tenth of a second."""
+        end_s = time.monotonic() + _SPIN_S
+        while (left_s := end_s - time.monotonic()) > 0:
+            self._executor.spin_once(left_s)
+
+    def state(self, node: str) -> NodeState | None:
+        """Return the state of a node, None where it has not been heard of."""
+        status = self.statuses.get(node)
+        return None if status is None else status.state
+
+    def value(self, node: str, name: str) -> int:
+        """Return a number out of the newest status of a node, zero where it has none of this name."""
+        status = self.statuses.get(node)
+        return int(float(status.values.get(name, "0"))) if status else 0
+
+    def losses(self) -> dict[str, int]:
+        """Return ``node.topic`` → messages that never reached their stage.
+
+        Lost on the way (sent by one node, not received by the next), dropped by an overloaded node, malformed, of another
+        session, or too early; feedback (``bias``), of which only the newest matters, does not count.
+        """
+        sent = {
+            key[5:]: int(value) for status in self.statuses.values() for key, value in status.values.items() if key[:5] == "sent."
+        }
+        lost: dict[str, int] = {}
+        for node, status in sorted(self.statuses.items()):
+            for key, value in status.values.items():
+                kind, _, name = key.partition(".")
+                if name == BIAS.name or kind not in ("received", "dropped", "node"):
+                    continue
+                count = sent.get(name, 0) - int(value) if kind == "received" else int(value)
+                if count > 0:
+                    lost[f"{node}.{name}"] = lost.get(f"{node}.{name}", 0) + count
+        return lost
+
+    def call(self, service: str, timeout_s: float) -> str:
+        """Call ``node/service`` (std_srvs/Trigger) and return its answer.
+
+        Raises:
+            GraphError: no answer in time, or a refusal.
+        """
+        client = self._node.create_client(Trigger, service)
+        future = client.call_async(Trigger.Request())
+        deadline_s = time.monotonic() + timeout_s
+        while not future.done() and time.monotonic() < deadline_s:
+            self.spin()
+        if not future.done():
+            raise GraphError(f"service '{service}' gave no answer in {timeout_s:g} s")
+        response = future.result()
+        if not response.success:
+            raise GraphError(f"service '{service}' refused: {response.message}")
+        answer: str = response.message
+        return answer
+
+    def _subscribe(self, topic: Topic, handle: Callable[[Any], None]) -> None:
+        self._node.create_subscription(message_type(topic), topic.name, handle, quality(topic, reading=True))
+
+    def _on_status(self, message: Any) -> None:
+        status = status_from_message(message)
+        self.statuses[status.node] = status
+        if status.node == _BACK_END and "tracking" in status.values:
+            values = status.values
+            self._recorder.add_state(int(values["stamp_ns"]), TrackingState(values["tracking"]), values["reason"])
