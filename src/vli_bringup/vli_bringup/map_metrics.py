@@ -20,6 +20,7 @@ SPACING_M = 1e-4
 REACH_M = 1e-3
 NEAR_M = 5e-4
 _CHUNK = 500_000
+_SPLIT_RADIUS_M = 2e-3
 _WORKERS = 2
 
 Triangles: TypeAlias = FloatArray
@@ -84,12 +85,28 @@ def _nearest(tree: KDTree, points: FloatArray, reach_m: float) -> tuple[FloatArr
 
 
 def near_triangles(triangles: Triangles, tree: KDTree, reach_m: float) -> Triangles:
-    """Return those triangles (K, 3, 3) that may hold a point within ``reach_m`` of the points of ``tree``."""
-    centres = triangles.mean(axis=1)
-    radius = np.linalg.norm(triangles - centres[:, None], axis=2).max(axis=1, initial=0.0)
-    distance, _ = _nearest(tree, centres, reach_m + float(radius.max(initial=0.0)) + SPACING_M)
-    near: Triangles = triangles[distance <= reach_m + radius]
-    return near
+    """Return triangles (K, 3, 3) that cover all of the surface within ``reach_m`` of the points of ``tree``, and little more.
+
+    Large ones are split, so that a map that touches one corner of a wall does not ask for all of the wall.
+    """
+    kept = [np.empty((0, 3, 3))]
+    while len(triangles):
+        centres = triangles.mean(axis=1)
+        radius = np.linalg.norm(triangles - centres[:, None], axis=2).max(axis=1)
+        distance, _ = _nearest(tree, centres, reach_m + float(radius.max()) + SPACING_M)
+        near = distance <= reach_m + radius
+        small = radius <= _SPLIT_RADIUS_M
+        kept.append(triangles[near & small])
+        triangles = _split(triangles[near & ~small])
+    return np.concatenate(kept)
+
+
+def _split(triangles: Triangles) -> Triangles:
+    """Return each triangle as the four that the middles of its edges make, (4 F, 3, 3), facing the same way."""
+    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
+    ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+    corners = ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))
+    return np.concatenate([np.stack(three, axis=1) for three in corners])
 
 
 def sample_surface(

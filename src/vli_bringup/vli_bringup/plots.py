@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from vli_bringup.trajectory_metrics import TrajectoryErrors
 
 _DPI = 130
+_MARGIN_MM = 5.0
 _TRUTH, _LIVE, _FINAL, _MISSING = "#9a9a9a", "#c2410c", "#1d4ed8", "#dc2626"
 _AXES = ("#b91c1c", "#15803d", "#1d4ed8")
 _STYLE: Any = {
@@ -107,22 +108,20 @@ def _components(axes: Axes, errors: TrajectoryErrors, values: FloatArray, result
 
 
 def _map(mapped: MapResult) -> Figure:
-    """Draw the map coloured by its signed distance to the surface, the histogram, and what of the seen surface is missing."""
+    """Draw the map coloured by its distance to the surface, the spread of that, and what of the seen surface is missing."""
     compared, seen = mapped.distances, mapped.seen
     plane = widest_axes(mapped.points)
-    figure = _figure(10, 0.6 + 3.7 * ((compared is not None) + (seen is not None)))
-    grid = figure.subplots(
-        (compared is not None) + (seen is not None),
-        2,
-        width_ratios=[3, 1],
-        squeeze=False,
-    )
+    rows = (compared is not None) + (seen is not None)
+    figure = _figure(10, 0.6 + 3.7 * rows)
+    grid = figure.subplots(rows, 2, width_ratios=[3, 1], squeeze=False)
+    grid[-1, 1].set_axis_off()
     if compared is not None:
         _heat_map(figure, grid[0, 0], mapped.points, 1e3 * compared.to_plane, plane)
         _histogram(grid[0, 1], 1e3 * compared.to_plane)
     if seen is not None and mapped.covered is not None:
         _coverage(grid[-1, 0], seen, mapped.covered, plane)
-        grid[-1, 1].set_axis_off()
+    if compared is not None and seen is not None:
+        _cumulative(grid[-1, 1], 1e3 * compared.to_point)
     return figure
 
 
@@ -141,15 +140,28 @@ def _heat_map(figure: Figure, axes: Axes, points: FloatArray, error: FloatArray,
     dots = axes.scatter(*_mm(points[shown], plane), c=error[shown], s=0.8, lw=0, cmap="RdBu_r", vmin=-limit, vmax=limit)
     figure.colorbar(dots, ax=axes, label="point to plane, mm", shrink=0.85, extend="both")
     _plane_axes(axes, plane, "Map, distance to the surface")
+    if near.any():  # what flew away would shrink the rest to a dot
+        first, second = _mm(points[near], plane)
+        axes.set_xlim(first.min() - _MARGIN_MM, first.max() + _MARGIN_MM)
+        axes.set_ylim(second.min() - _MARGIN_MM, second.max() + _MARGIN_MM)
 
 
 def _histogram(axes: Axes, error: FloatArray) -> None:
     near, limit = np.isfinite(error), _limit(error)
     axes.hist(error[near], bins=np.linspace(-1.5 * limit, 1.5 * limit, 81).tolist(), color="#475569")
     axes.axvline(0, color="black", lw=0.6)
+    axes.set_axis_on()
     title = f"RMSE {rms(error[near]):.3f} mm" if near.any() else "nothing within 1 mm"
     axes.set(xlabel="point to plane, mm", yticks=[], title=title)
     axes.grid(visible=False)
+
+
+def _cumulative(axes: Axes, distance: FloatArray) -> None:
+    """Draw the share of all map points, those beyond 1 mm included, within a distance of the surface."""
+    steps = np.linspace(0, 1, 201)
+    axes.set_axis_on()
+    axes.plot(steps, 100 * np.searchsorted(np.sort(distance), steps, side="right") / len(distance), color="#475569", lw=1.4)
+    axes.set(xlabel="point to point, mm", ylabel="map points within, %", title="Map points", xlim=(0, 1), ylim=(0, 101))
 
 
 def _coverage(axes: Axes, seen: FloatArray | Float32Array, covered: BoolArray, plane: tuple[int, int]) -> None:
