@@ -11,7 +11,7 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from vli_common.arrays import AnyArray, ByteArray, Float32Array, FloatArray, IntArray
+from vli_common.arrays import AnyArray, BoolArray, ByteArray, Float32Array, FloatArray, IntArray
 from vli_common.types import Counters
 from vli_driver import stripe_kernels as kernels
 from vli_driver.config import StripeConfig
@@ -89,10 +89,12 @@ class CentreOfMassDetector:
         )
         ratio = config.min_colour_ratio if profiles.shape[2] > 1 else 0.0
         keep = kernels.keep_segments(located, ambiguous, config.max_jump_px, config.min_segment_points, ratio)
-        lean = kernels.steady_lean(located, keep)
-        keep &= np.abs(lean) <= config.max_lean
+        sigma_px = self._sigma_px(located, keep)
+        lean_px = kernels.steady_lean(located, keep) * located[:, 7]
+        # Speckle and noise make the median of nine neighbours lean by less than half a sigma.
+        keep &= np.abs(lean_px) <= np.maximum(config.max_lean * located[:, 7], sigma_px)
         kernels.trim_segments(located, keep, config.max_jump_px, config.trim_points, config.min_segment_points)
-        return self._points(located, lean, np.flatnonzero(keep))
+        return self._points(located, np.hypot(sigma_px, _LEAN_BIAS * lean_px), np.flatnonzero(keep))
 
     def _profiles(self, pixels: ByteArray) -> ByteArray:
         """Return the band as profiles (N, M, C), contiguous."""
@@ -121,17 +123,20 @@ class CentreOfMassDetector:
             return int(np.argmax(kernels.channel_strength(profiles, self._first, self._last)))
         return _CHANNELS[self.config.channel]
 
-    def _points(self, located: FloatArray, lean: FloatArray, rows: IntArray) -> StripePoints:
+    def _sigma_px(self, located: FloatArray, keep: BoolArray) -> FloatArray:
+        """Return (N,) one standard deviation of sensor noise, speckle and lens model."""
+        total, sensor, speckled = located[:, 2], located[:, 3], located[:, 4]
+        speckle = speckle_contrast(total[keep], speckled[keep]) if keep.sum() > 1 else 0.0
+        sigma_px: FloatArray = np.sqrt((sensor + speckle**2 * speckled) / total**2 + self.config.sigma_floor_px**2)
+        return sigma_px
+
+    def _points(self, located: FloatArray, sigma_px: FloatArray, rows: IntArray) -> StripePoints:
         if len(rows) < self.config.min_points:
             self.counters.add("no_stripe")
             return StripePoints(np.empty((0, 2)), np.empty(0), np.empty(0))
-        centre, peak, total, sensor, speckled, _, _, width = located[rows].T
-        across = centre + self._start
+        across = located[rows, 0] + self._start
         pixels = np.stack([rows, across] if self.band.along_columns else [across, rows], axis=1).astype(np.float64)
-        speckle = speckle_contrast(total, speckled)
-        bias = _LEAN_BIAS * lean[rows] * width
-        sigma_px = np.sqrt((sensor + speckle**2 * speckled) / total**2 + bias**2 + self.config.sigma_floor_px**2)
-        return StripePoints(pixels, peak, sigma_px)
+        return StripePoints(pixels, located[rows, 1], sigma_px[rows])
 
 
 def speckle_contrast(total: FloatArray, speckled: FloatArray) -> float:
