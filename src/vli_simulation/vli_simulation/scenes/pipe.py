@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vli_common.arrays import ByteArray, FloatArray
+from vli_common.arrays import FloatArray
 from vli_common.geometry import so3_exp
 from vli_simulation.mesh import Mesh, grid_faces, join, loft, make_mesh
 from vli_simulation.motion import ScanPath
@@ -19,6 +19,7 @@ _FINE_HALF_ARC = 1.25
 _BEAD_HEIGHT, _BEAD_SIGMA = 1.1e-3, 1.7e-3
 _AXIS_TILT_DEG = 6.0
 _SCAN_AZIMUTH_DEG = 35.0
+_MARKS, _MARK_SIZE = ("W1", "DN", "110", "W2", "S4", "7B"), 0.018
 _RUST, _WELD, _BOLT, _WASHER, _PAINT = range(5)
 
 
@@ -33,8 +34,11 @@ def make_pipe(seed: int) -> Scene:
         for side in (-1, 1)
         for arc in (-0.62, -0.2, 0.2, 0.62)
     ]
-    marks, tiles = _marks(wall, beads, rng)
-    mesh = join([wall.mesh(), *marks, *bolts])
+    shell = wall.mesh()
+    tiles = np.stack([print_tile(text, 0.75, (0.16, 0.6)) for text in _MARKS])
+    for index in range(len(_MARKS)):
+        wall.paint(shell, index, beads[index % 3] + (0.016 if index < 3 else -0.034), rng.uniform(-0.2, 0.2))
+    mesh = join([shell, *bolts])
     roll, tilt = np.deg2rad(_SCAN_AZIMUTH_DEG + rng.normal(0, 4)), np.deg2rad(_AXIS_TILT_DEG + rng.normal(0, 1))
     R_world_pipe = so3_exp(np.array([0.0, tilt, 0.0])) @ so3_exp(np.array([roll, 0.0, 0.0]))
     lift = np.array([0.0, 0.0, 0.12])
@@ -50,7 +54,7 @@ def _materials(rng: np.random.Generator) -> tuple[Material, ...]:
     return (
         Material(steel, rust, stain_cell=0.0065, stain=0.62, grain=0.17, speck_density=0.25, speck=0.5, gloss=0.05, shininess=25),
         Material(
-            jitter((0.42, 0.41, 0.42), rng),
+            jitter((0.375, 0.35, 0.335), rng),
             jitter((0.33, 0.27, 0.30), rng),
             stain_cell=0.002,
             stain=0.5,
@@ -105,9 +109,9 @@ class _Wall:
         pits = -5e-4 * np.clip(self._noise(x + 0.7, arc, 0.0035, 1) - 1.35, 0, 1)
         return rough + pits + self.weld(x, arc) + 4e-4 * np.sin(3 * arc + 17 * x)
 
-    def place(self, x: FloatArray, arc: FloatArray, lift: FloatArray | float = 0.0) -> FloatArray:
-        """Return points (N, 3) of the wall in the pipe's frame, lifted towards the axis."""
-        radius = _RADIUS - self.height(x, arc) - lift
+    def place(self, x: FloatArray, arc: FloatArray) -> FloatArray:
+        """Return points (N, 3) of the wall in the pipe's frame."""
+        radius = _RADIUS - self.height(x, arc)
         return np.stack([x, radius * np.sin(arc), -radius * np.cos(arc)], axis=1)
 
     def mesh(self) -> Mesh:
@@ -121,6 +125,16 @@ class _Wall:
         mesh = make_mesh(self.place(flat_x, flat_arc), faces, _RUST)
         mesh.material[self.bright(flat_x, flat_arc)[faces].mean(axis=1) > 0.5] = _WELD
         return mesh
+
+    def paint(self, shell: Mesh, tile: int, x: float, arc: float) -> None:
+        """Stencil a tile on the bare wall, from x and around ``arc``; changes ``shell``, which :meth:`mesh` made."""
+        vertices = shell.vertices
+        u = (vertices[:, 0] - x) / _MARK_SIZE
+        v = 0.5 - (np.arctan2(vertices[:, 1], -vertices[:, 2]) - arc) * _RADIUS / _MARK_SIZE
+        inside = (np.abs(u - 0.5) < 0.5) & (np.abs(v - 0.5) < 0.5)
+        faces = inside[shell.faces].all(axis=1) & (shell.material == _RUST)
+        shell.material[faces], shell.tile[faces] = _PAINT, tile
+        shell.uv[inside] = np.stack([u, v], axis=1)[inside]
 
     def _noise(self, x: FloatArray, arc: FloatArray, cell: float, octaves: int) -> FloatArray:
         points = np.stack([x, _RADIUS * np.sin(arc), _RADIUS * np.cos(arc)], axis=1)
@@ -160,19 +174,3 @@ def _on_wall(vertices: FloatArray, x: float, arc: float) -> FloatArray:
     origin = np.array([x, _RADIUS * np.sin(arc), -_RADIUS * np.cos(arc)])
     result: FloatArray = vertices @ axes + origin
     return result
-
-
-def _marks(wall: _Wall, beads: FloatArray, rng: np.random.Generator) -> tuple[list[Mesh], ByteArray]:
-    """Return stencilled marks: patches a hair above the wall that are wall but for the paint."""
-    texts = ("W1", "DN", "110", "W2", "S4", "7B")
-    tiles = np.stack([print_tile(text, 0.75, (0.16, 0.6)) for text in texts])
-    patches = []
-    for index in range(len(texts)):
-        x0, arc0 = beads[index % 3] + (0.016 if index < 3 else -0.034), rng.uniform(-0.2, 0.2)
-        x, arc = x0 + np.arange(0.0, 0.018, _STEP), arc0 + np.arange(-0.009, 0.009, _STEP) / _RADIUS
-        gx, ga = np.meshgrid(x, arc, indexing="ij")
-        uv = np.stack([(gx - x0) / 0.018, 0.5 + (ga - arc0) * _RADIUS / 0.018], axis=-1).reshape(-1, 2)
-        uv[:, 1] = 1 - uv[:, 1]
-        faces = grid_faces(*gx.shape)[:, ::-1].copy()
-        patches.append(make_mesh(wall.place(gx.ravel(), ga.ravel(), 2e-5), faces, _PAINT, index, uv))
-    return patches, tiles
