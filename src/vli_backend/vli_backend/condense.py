@@ -236,7 +236,7 @@ def refine(
     iterations: int = 5,
 ) -> FloatArray:
     """Solve every used landmark for its own inverse depth, poses (K, 4, 4) fixed; return the information of ρ (L,), m²."""
-    information: FloatArray = _refine(*_pairs(T_map_camera), use, *landmarks.columns(), cauchy, limits, iterations)
+    information: FloatArray = _refine(*_pairs(T_map_camera), use, *landmarks.columns(), cauchy, limits, iterations)  # type: ignore[call-arg]
     return information
 
 
@@ -244,12 +244,12 @@ def condense(landmarks: LandmarkArrays, T_map_camera: FloatArray, use: BoolArray
     """Return eqs. (2) and (3) of the used landmarks as a quadratic in the K camera poses (K, 4, 4), depths eliminated."""
     size = 6 * len(T_map_camera)
     hessian, gradient = np.zeros((size, size)), np.zeros(size)
-    cost = _condense(*_pairs(T_map_camera), use, *landmarks.columns(), cauchy, hessian, gradient)
+    cost = _condense(*_pairs(T_map_camera), use, *landmarks.columns(), cauchy, hessian, gradient)  # type: ignore[call-arg]
     return Quadratic(hessian, gradient, float(cost))
 
 
-def _pairs(T_map_camera: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _pairs(T_map_camera: FloatArray) -> tuple[AnyArray, ...]:
     """Return R_ja (K, K, 3, 3) and t_ja (K, K, 3) between all pairs of poses (K, 4, 4)."""
     rotations, translations = np.ascontiguousarray(T_map_camera[:, :3, :3]), np.ascontiguousarray(T_map_camera[:, :3, 3])
-    relative_r, relative_t = _relative_poses(rotations, translations)
-    return relative_r, relative_t
+    pairs: tuple[AnyArray, ...] = _relative_poses(rotations, translations)
+    return pairs

@@ -14,11 +14,12 @@ from vli_backend.frame_pose import FramePose, solve_frame_pose
 from vli_backend.landmarks import LandmarkTable
 from vli_backend.laser_depth import measure_slot
 from vli_backend.map_residuals import condense_map
+from vli_backend.prediction import Prediction, Predictor
 from vli_backend.smoother import Condenser, GtsamSmoother, KeyframeState, Smoother, SmootherError, StatePrior
 from vli_backend.window import FrameRecord, Window, close_interval
 from vli_common.arrays import BoolArray, FloatArray
 from vli_common.calibration import Calibration
-from vli_common.geometry import inverse, so3_exp, so3_log
+from vli_common.geometry import inverse
 from vli_common.types import (
     FrontEndOutput,
     ImuBias,
@@ -83,7 +84,8 @@ class WindowEstimator:
         self._window.append(first.stamp_ns, first.stationary, None)
         self._add_observations(first)
         self._records = [FrameRecord(first.stamp_ns, state.T_map_imu @ self._T_imu_cam, first.stationary)]
-        self._previous = self._records[0]
+        self._predictor = Predictor(self._T_imu_cam)
+        self._predictor.set_keyframe(first.stamp_ns, state)
         self._measure_depths()
         self._points = self._landmarks.points(self._keyframe_poses())
 
@@ -106,8 +108,9 @@ class WindowEstimator:
         if stamp_ns > self._records[-1].stamp_ns:
             last = self._records[-1]
             self._records.append(FrameRecord(stamp_ns, last.T_map_camera, last.stationary))
+            self._predictor.observe(stamp_ns, last.T_map_camera)
         covariance = np.diag([1e-8] * 6)
-        pose = self._estimate(stamp_ns, self._records[-1].T_map_camera, self._state.velocity, np.zeros(3), covariance, session)
+        pose = self._estimate(stamp_ns, self._records[-1].T_map_camera, self._state.velocity, covariance, session)
         return FrameResult(
             pose, len(self._points.ids), self._window.poses(self._keyframe_poses(), 0, session), self._bias(session)
         )
@@ -115,17 +118,15 @@ class WindowEstimator:
     def add_frame(self, frame: FrontEndOutput, session: int) -> FrameResult:
         """Return the pose of one long frame; at a keyframe, solve the window."""
         tracks, imu = frame.tracks, self._usable(frame.preintegration)
-        predicted, velocity = self._predict(tracks.stamp_ns, imu)
-        found = self._frame_pose(tracks, predicted, imu is not None, tracks.stamp_ns - self._window.stamps[-1])
+        predicted = self._predictor.predict(tracks.stamp_ns, imu, tracks.stationary)
+        found = self._frame_pose(tracks, predicted)
+        self._predictor.observe(tracks.stamp_ns, found.T_map_camera)
         self._restarted.update(int(i) for i in tracks.ids[(tracks.flags & TrackFlag.TEMPLATE) > 0])
         self._records.append(FrameRecord(tracks.stamp_ns, found.T_map_camera, tracks.stationary))
-        if not tracks.keyframe:
-            covariance = self._covariance(found)
-            rate = self._angular_rate()
-            self._previous = self._records[-1]
-            pose = self._estimate(tracks.stamp_ns, found.T_map_camera, velocity, rate, covariance, session)
-            return FrameResult(pose, found.inliers)
-        return self._add_keyframe(tracks, imu, found, velocity, session)
+        if tracks.keyframe:
+            return self._add_keyframe(tracks, imu, found, predicted.velocity, session)
+        pose = self._estimate(tracks.stamp_ns, found.T_map_camera, predicted.velocity, self._covariance(found), session)
+        return FrameResult(pose, found.inliers)
 
     def add_start_keyframe(
         self, tracks: Tracks, state: KeyframeState, imu: gtsam.PreintegratedCombinedMeasurements | None
@@ -138,6 +139,10 @@ class WindowEstimator:
     def finish_start(self) -> None:
         """Solve the window of a start in motion."""
         self._solve(self._config.start_iterations)
+        self._records = [
+            FrameRecord(self._window.stamps[-1], self._state.T_map_imu @ self._T_imu_cam, self._window.stationary[-1])
+        ]
+        self._predictor.set_keyframe(self._window.stamps[-1], self._state)
 
     def flush(self, session: int) -> WindowPoses | None:
         """Return all frames as final, those after the newest keyframe included."""
@@ -157,29 +162,11 @@ class WindowEstimator:
             return None
         return cast(gtsam.PreintegratedCombinedMeasurements, preintegration.measurements)
 
-    def _predict(self, stamp_ns: int, imu: gtsam.PreintegratedCombinedMeasurements | None) -> tuple[FloatArray, FloatArray]:
-        """Return ``T_map_camera`` and velocity from the IMU, or from constant velocity where it is missing."""
-        if imu is not None:
-            nav = imu.predict(self._state.nav_state(), self._state.bias())
-            return nav.pose().matrix() @ self._T_imu_cam, nav.velocity()
-        last, before = self._records[-1], self._previous
-        if last.stamp_ns == before.stamp_ns:
-            return last.T_map_camera, self._state.velocity
-        ahead = (stamp_ns - last.stamp_ns) / (last.stamp_ns - before.stamp_ns)
-        step = inverse(before.T_map_camera) @ last.T_map_camera
-        predicted = last.T_map_camera.copy()
-        predicted[:3, 3] += ahead * (last.T_map_camera[:3, 3] - before.T_map_camera[:3, 3])
-        predicted[:3, :3] = predicted[:3, :3] @ so3_exp(min(ahead, 3.0) * so3_log(step[:3, :3]))
-        return predicted, (last.T_map_camera[:3, 3] - before.T_map_camera[:3, 3]) / ((last.stamp_ns - before.stamp_ns) * 1e-9)
-
-    def _frame_pose(self, tracks: Tracks, predicted: FloatArray, with_imu: bool, elapsed_ns: int) -> FramePose:
+    def _frame_pose(self, tracks: Tracks, predicted: Prediction) -> FramePose:
         _, rows, columns = np.intersect1d(self._points.ids, tracks.ids, assume_unique=True, return_indices=True)
-        elapsed = elapsed_ns * 1e-9
-        rotation, position = (5e-4 + 2e-3 * elapsed, 2e-4 + 1e-2 * elapsed) if with_imu else (0.05, 0.01)
-        prior = np.diag(np.repeat([rotation**-2, position**-2], 3))
         return solve_frame_pose(
-            predicted,
-            prior,
+            predicted.T_map_camera,
+            predicted.information,
             self._points.positions[rows],
             self._points.spread[rows],
             tracks.rays[columns],
@@ -189,13 +176,6 @@ class WindowEstimator:
 
     def _ray_sigma(self, tracks: Tracks) -> FloatArray:
         result: FloatArray = np.hypot(tracks.sigma_px, self._config.pixel_sigma) / self._focal_px
-        return result
-
-    def _angular_rate(self) -> FloatArray:
-        """Return the angular velocity (3,) of imu_link from the last two frames."""
-        last, before = self._records[-1], self._previous
-        turn = so3_log(before.T_map_camera[:3, :3].T @ last.T_map_camera[:3, :3])
-        result: FloatArray = self._T_imu_cam[:3, :3] @ turn / max((last.stamp_ns - before.stamp_ns) * 1e-9, 1e-6)
         return result
 
     # -- one keyframe ------------------------------------------------------------------------------------------------------
@@ -208,7 +188,6 @@ class WindowEstimator:
         velocity: FloatArray,
         session: int,
     ) -> FrameResult:
-        rate = self._angular_rate()
         T_odom_imu = inverse(self._T_map_odom) @ found.T_map_camera @ self._T_cam_imu
         state = KeyframeState(found.T_map_camera @ self._T_cam_imu, velocity, self._state.gyro_bias, self._state.accel_bias)
         self._append_keyframe(tracks, state, imu)
@@ -216,12 +195,12 @@ class WindowEstimator:
         self._moving_keyframes += int(moving)
         first_ones = moving and self._moving_keyframes <= self._config.start_keyframes
         self._solve(self._config.start_iterations if first_ones else self._config.iterations)
-        self._previous = self._records[-2] if len(self._records) > 1 else self._records[-1]
+        self._predictor.set_keyframe(tracks.stamp_ns, self._state)
         T = self._state.T_map_imu
         self._records = [FrameRecord(tracks.stamp_ns, T @ self._T_imu_cam, tracks.stationary)]
         self._T_map_odom = T @ inverse(T_odom_imu)
         pose = self._estimate(
-            tracks.stamp_ns, self._records[0].T_map_camera, self._state.velocity, rate, self._covariance(found), session
+            tracks.stamp_ns, self._records[0].T_map_camera, self._state.velocity, self._covariance(found), session
         )
         window = self._leave(session)
         return FrameResult(pose, found.inliers, window, self._bias(session))
@@ -336,11 +315,18 @@ class WindowEstimator:
         stamp_ns: int,
         T_map_camera: FloatArray,
         velocity: FloatArray,
-        rate: FloatArray,
         covariance: FloatArray,
         session: int,
     ) -> PoseEstimate:
-        return PoseEstimate(stamp_ns, T_map_camera @ self._T_cam_imu, self._T_map_odom, velocity, rate, covariance, session)
+        return PoseEstimate(
+            stamp_ns,
+            T_map_camera @ self._T_cam_imu,
+            self._T_map_odom,
+            velocity,
+            self._predictor.angular_velocity,
+            covariance,
+            session,
+        )
 
 
 def _inverse_depth_limits(calibration: Calibration) -> tuple[float, float]:

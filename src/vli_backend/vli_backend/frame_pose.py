@@ -13,6 +13,9 @@ import numpy as np
 
 from vli_common.arrays import FloatArray
 
+_INLIER_SQUARED = 18.0
+"""Squared residual (2 dof, in sigmas) up to which a landmark counts as matched; the robust loss weighs it anyway."""
+
 
 @dataclass(frozen=True)
 class FramePose:
@@ -44,11 +47,32 @@ def _log_so3(r):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True)
-def _solve(rotation, translation, points, spread, rays, sigma, prior, cauchy, iterations):  # type: ignore[no-untyped-def]
+def _weights(rotation, translation, points, spread, sigma):  # type: ignore[no-untyped-def]
+    """Return the inverse covariances (N, 3: xx, xy, yy) of the residuals, σ² I + d dᵀ with d the depth's spread in the image.
+
+    They are taken at the prediction and held: recomputed at every step they would reward a step away from it, where an unknown
+    depth hides any error.
+    """
+    out = np.zeros((len(points), 3))
+    for i in range(len(points)):
+        x = rotation.T @ (points[i] - translation)
+        d = rotation.T @ spread[i]
+        if x[2] <= 1e-6:
+            continue
+        d0, d1 = (d[0] - x[0] / x[2] * d[2]) / x[2], (d[1] - x[1] / x[2] * d[2]) / x[2]
+        s2 = sigma[i] * sigma[i]
+        # Sherman–Morrison.
+        f = 1.0 / (s2 + d0 * d0 + d1 * d1)
+        out[i, 0], out[i, 1], out[i, 2] = (1.0 - d0 * d0 * f) / s2, -d0 * d1 * f / s2, (1.0 - d1 * d1 * f) / s2
+    return out
+
+
+@numba.njit(cache=True)
+def _solve(rotation, translation, points, weights, rays, prior, cauchy, iterations):  # type: ignore[no-untyped-def]
     start_r, start_t = rotation.copy(), translation.copy()
     h, g = np.zeros((6, 6)), np.zeros(6)
     inliers, squares, done = 0, 0.0, 0
-    j0, j1, delta, x, d = np.empty(6), np.empty(6), np.empty(6), np.empty(3), np.empty(3)
+    j0, j1, delta, x = np.empty(6), np.empty(6), np.empty(6), np.empty(3)
     for step in range(iterations):
         done = step + 1
         delta[:3] = _log_so3(start_r.T @ rotation)
@@ -58,23 +82,18 @@ def _solve(rotation, translation, points, spread, rays, sigma, prior, cauchy, it
         inliers, squares = 0, 0.0
         for i in range(len(points)):
             for m in range(3):
-                x[m], d[m] = 0.0, 0.0
+                x[m] = 0.0
                 for n in range(3):
                     x[m] += rotation[n, m] * (points[i, n] - translation[n])
-                    d[m] += rotation[n, m] * spread[i, n]
             if x[2] <= 1e-6:
                 continue
             z = 1.0 / x[2]
             u, v = x[0] * z, x[1] * z
             e0, e1 = u - rays[i, 0], v - rays[i, 1]
-            d0, d1 = (d[0] - u * d[2]) * z, (d[1] - v * d[2]) * z
-            # Inverse of σ² I + d dᵀ (Sherman–Morrison).
-            s2 = sigma[i] * sigma[i]
-            f = 1.0 / (s2 + d0 * d0 + d1 * d1)
-            a, b, c = (1.0 - d0 * d0 * f) / s2, -d0 * d1 * f / s2, (1.0 - d1 * d1 * f) / s2
+            a, b, c = weights[i, 0], weights[i, 1], weights[i, 2]
             squared = a * e0 * e0 + 2.0 * b * e0 * e1 + c * e1 * e1
             w = 1.0 / (1.0 + squared / (cauchy * cauchy))
-            if squared < 9.0 + 9.0 * cauchy:
+            if squared < _INLIER_SQUARED:
                 inliers += 1
                 squares += squared
             j0[0], j0[1], j0[2] = u * v, -(1.0 + u * u), v
@@ -91,6 +110,8 @@ def _solve(rotation, translation, points, spread, rays, sigma, prior, cauchy, it
         rotation = rotation @ _exp_so3(update[:3])
         if np.abs(update[:3]).max() < 1e-7 and np.abs(update[3:]).max() < 1e-9:
             break
+    # One Newton step of the polar decomposition: poses are chained from frame to frame, and rounding errors would grow.
+    rotation = rotation @ (1.5 * np.eye(3) - 0.5 * rotation.T @ rotation)
     return rotation, translation, h, inliers, squares, done
 
 
@@ -116,16 +137,10 @@ def solve_frame_pose(
         cauchy: in sigmas.
         iterations: at most.
     """
+    rotation, translation = np.ascontiguousarray(T_predicted[:3, :3]), np.ascontiguousarray(T_predicted[:3, 3])
+    weights = _weights(rotation, translation, points, spread, sigma)
     rotation, translation, h, inliers, squares, done = _solve(
-        np.ascontiguousarray(T_predicted[:3, :3]),
-        np.ascontiguousarray(T_predicted[:3, 3]),
-        points,
-        spread,
-        np.ascontiguousarray(rays),
-        sigma,
-        prior,
-        cauchy,
-        iterations,
+        rotation, translation, points, weights, np.ascontiguousarray(rays), prior, cauchy, iterations
     )
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = rotation, translation

@@ -38,7 +38,9 @@ def rest_state(measurements: gtsam.PreintegratedCombinedMeasurements) -> Keyfram
     force = measurements.deltaVij() / elapsed
     gyro_bias = so3_log(measurements.deltaRij().matrix()) / elapsed + measurements.biasHatVector()[3:]
     R_map_imu = rotation_between(force, np.array([0.0, 0.0, 1.0]))
-    return KeyframeState(pose(R_map_imu, np.zeros(3)), np.zeros(3), gyro_bias, np.zeros(3))
+    # What the length of the force says of the bias; the rest of it cannot be told from tilt.
+    accel_bias = force * (1.0 - GRAVITY / np.linalg.norm(force)) + measurements.biasHatVector()[:3]
+    return KeyframeState(pose(R_map_imu, np.zeros(3)), np.zeros(3), gyro_bias, accel_bias)
 
 
 def bundle_adjust(condenser: Condenser, T_map_camera: FloatArray, iterations: int) -> tuple[FloatArray, float]:
