@@ -2,7 +2,8 @@
 
     python test/perf/bench_stripe.py [RECORDING]
 
-RECORDING (default ``../shared/data/keyboard_short``) holds ``bag/``, ``calibration.yaml``, ``truth.tum``, ``surface.ply``, ``seen.ply``.
+RECORDING (default ``../shared/data/keyboard_short``) holds ``bag/``, ``calibration.yaml``, ``truth.tum``, ``surface.ply``,
+``seen.ply``.
 Exit code 1 where a bar is missed.
 """
 
@@ -17,6 +18,7 @@ import numpy as np
 import trimesh
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation, Slerp
+
 from vli_common.arrays import FloatArray
 from vli_common.calibration import Calibration, load_calibration
 from vli_common.geometry import pose, transform

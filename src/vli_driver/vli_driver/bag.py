@@ -47,8 +47,8 @@ class BagTopics:
 class BagReader:
     """A rosbag2 directory (metadata.yaml may be missing), a bare ``.mcap`` or a ``.db3``.
 
-    Iterating yields :class:`EncodedImage` and :class:`ImuSample` in log order; what the exposure topic says is folded into the image
-    of the same stamp. ``start_s`` and ``duration_s`` count from the header stamp of the first image or IMU message.
+    Iterating yields :class:`EncodedImage` and :class:`ImuSample` in log order; what the exposure topic says is folded into the
+    image of the same stamp. ``start_s`` and ``duration_s`` count from the header stamp of the first image or IMU message.
 
     Args:
         path: the bag.
@@ -60,7 +60,9 @@ class BagReader:
         InputError: nothing usable is there; the message says what is, and what to do.
     """
 
-    def __init__(self, path: Path | str, topics: BagTopics | None = None, start_s: float = 0.0, duration_s: float | None = None) -> None:
+    def __init__(
+        self, path: Path | str, topics: BagTopics | None = None, start_s: float = 0.0, duration_s: float | None = None
+    ) -> None:
         self.path = Path(path)
         self.warnings: list[str] = []
         self.counters = Counters()
@@ -171,12 +173,17 @@ class BagReader:
                 return self._typed(candidate, _IMAGE_TYPES, "sensor_msgs/Image or CompressedImage")
         candidates = self._of_type(_IMAGE_TYPES)
         # X and X/compressed are one camera: the raw one serves.
-        cameras = [topic for topic in candidates if topic.removesuffix("/compressed") == topic or topic.removesuffix("/compressed") not in candidates]
+        cameras = [
+            topic
+            for topic in candidates
+            if topic.removesuffix("/compressed") == topic or topic.removesuffix("/compressed") not in candidates
+        ]
         if name != DEFAULT_IMAGE_TOPIC or not cameras:
             raise self._missing("image", name)
         if len(cameras) > 1:
             raise InputError(
-                f"'{self.path}' has {len(cameras)} image topics ({', '.join(cameras)}); choose one with --topic image={cameras[0]}"
+                f"'{self.path}' has {len(cameras)} image topics ({', '.join(cameras)}); choose one with --topic "
+                f"image={cameras[0]}"
             )
         return cameras[0]
 
@@ -190,7 +197,8 @@ class BagReader:
             return None
         if topics.imu == DEFAULT_IMU_TOPIC and candidates:
             raise InputError(
-                f"'{self.path}' has {len(candidates)} IMU topics ({', '.join(candidates)}); choose one with --topic imu={candidates[0]}"
+                f"'{self.path}' has {len(candidates)} IMU topics ({', '.join(candidates)}); choose one with "
+                f"--topic imu={candidates[0]}"
             )
         raise self._missing("imu", topics.imu)
 
@@ -278,7 +286,7 @@ def _files_of(directory: Path) -> list[Path]:
 
 
 def _check_metadata(directory: Path) -> None:
-    """Refuse per-message compression, which only metadata.yaml tells; a missing or broken metadata.yaml is not needed otherwise."""
+    """Refuse per-message compression, which only metadata.yaml tells; for nothing else it is needed."""
     metadata = directory / "metadata.yaml"
     if not metadata.is_file():
         return
@@ -287,7 +295,9 @@ def _check_metadata(directory: Path) -> None:
     except (yaml.YAMLError, KeyError, TypeError):
         return
     if str(information.get("compression_mode", "")).upper() == "MESSAGE":
-        raise InputError(f"'{directory}' is compressed message by message; convert it with: ros2 bag convert (mcap with chunk compression)")
+        raise InputError(
+            f"'{directory}' is compressed message by message; convert it with: ros2 bag convert (mcap with chunk compression)"
+        )
 
 
 def _merge_topics(files: list[BagFile]) -> dict[str, TopicInfo]:

@@ -8,7 +8,7 @@ import zlib
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, NamedTuple, Protocol
+from typing import Any, BinaryIO, NamedTuple, Protocol
 
 from vli_common.errors import InputError
 from vli_common.types import NANOSECONDS
@@ -67,7 +67,8 @@ class _Segment:
 class McapFile:
     """An mcap file, read without its index, so that a file that was cut or has rotten chunks is read like a whole one.
 
-    Opening walks over the record headers only and decompresses chunks just as far as the channels must be known and messages counted.
+    Opening walks over the record headers only and decompresses chunks just as far as the channels must be known and messages
+    counted.
 
     Raises:
         InputError: the file is empty or is no mcap.
@@ -248,7 +249,8 @@ class Sqlite3File:
         """See :meth:`BagFile.messages`."""
         keys = [key for key, name in self._names.items() if name in topics]
         marks = ",".join("?" * len(keys))
-        query = f"SELECT timestamp, topic_id, data FROM messages WHERE topic_id IN ({marks}) AND timestamp BETWEEN ? AND ? ORDER BY timestamp"
+        chosen = f"topic_id IN ({marks}) AND timestamp BETWEEN ? AND ?"
+        query = f"SELECT timestamp, topic_id, data FROM messages WHERE {chosen} ORDER BY timestamp"
         with self._connect() as connection:
             try:
                 for log_ns, key, data in connection.execute(query, (*keys, start_ns, end_ns if end_ns is not None else 2**62)):
@@ -259,7 +261,7 @@ class Sqlite3File:
     def _connect(self) -> sqlite3.Connection:
         return sqlite3.connect(f"file:{self.path}?mode=ro&immutable=1", uri=True)
 
-    def _query(self, connection: sqlite3.Connection, query: str) -> list[tuple[int, ...] | tuple[int, str, str]]:
+    def _query(self, connection: sqlite3.Connection, query: str) -> list[Any]:
         try:
             return connection.execute(query).fetchall()
         except sqlite3.Error as error:
@@ -302,7 +304,7 @@ def _decompress(data: bytes, segment: _Segment) -> bytes:
         except zstandard.ZstdError as error:
             raise ValueError(str(error)) from error
     elif segment.compression == "lz4":
-        import lz4.frame
+        import lz4.frame  # type: ignore[import-untyped]
 
         try:
             data = lz4.frame.decompress(data)

@@ -7,8 +7,9 @@ the end of that header. Everything else goes through the typestore of ``rosbags`
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from rosbags.typesys import Stores, get_typestore
@@ -21,6 +22,8 @@ COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 IMU = "sensor_msgs/msg/Imu"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
+
+T = TypeVar("T")
 
 _STORE = get_typestore(Stores.ROS2_JAZZY)
 _ENCAPSULATION = 4
@@ -133,7 +136,7 @@ def read_any(data: bytes, msgtype: str) -> Any:
         raise MessageError(f"malformed {msgtype} of {len(data)} bytes: {error}") from error
 
 
-def _guarded(reader: Any, data: bytes) -> Any:
+def _guarded(reader: Callable[[_Cursor], T], data: bytes) -> T:
     try:
         return reader(_Cursor(data))
     except (struct.error, ValueError) as error:

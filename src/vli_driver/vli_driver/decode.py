@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import Literal
+from typing import Literal, cast
 
 import cv2
 import numpy as np
@@ -41,7 +41,7 @@ def decode(image: EncodedImage, route: Route = "native") -> Image:
     """
     pixels = _decode_compressed(image, route) if image.compressed else _decode_raw(image)
     if route == "grey" and pixels.ndim == 3:
-        pixels = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
+        pixels = cast(ByteArray, cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY))
     return Image(image.stamp_ns, pixels, exposure_s=image.exposure_s, laser_on=image.laser_on)
 
 
@@ -70,7 +70,9 @@ def _decode_compressed(image: EncodedImage, route: Route) -> ByteArray:
     elif image.data[:4] == _PNG:
         pixels = _decode_png(image)
     else:
-        raise InputError(f"compressed image of format '{image.encoding}' starts with '{image.data[:4].hex()}', expected a jpeg or a png")
+        raise InputError(
+            f"compressed image of format '{image.encoding}' starts with '{image.data[:4].hex()}', expected a jpeg or a png"
+        )
     if pixels.ndim == 2 and mosaic is not None and mosaic["kind"] == "bayer":
         return _to_bgr(pixels, "bayer", mosaic["pattern"])
     return pixels
@@ -83,21 +85,21 @@ def _decode_jpeg(image: EncodedImage, route: Route) -> ByteArray:
         pixels = simplejpeg.decode_jpeg(image.data, "GRAY" if grey else "BGR")
     except ValueError as error:
         raise InputError(f"jpeg of {len(image.data)} bytes, format '{image.encoding}', is broken: {error}") from error
-    return pixels[:, :, 0] if grey else pixels
+    return cast(ByteArray, pixels[:, :, 0] if grey else pixels)
 
 
 def _decode_png(image: EncodedImage) -> ByteArray:
     pixels = cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH)
     if pixels is None:
         raise InputError(f"png of {len(image.data)} bytes, format '{image.encoding}', is broken; record again")
-    return pixels if pixels.dtype == np.uint8 else _eight_bits(pixels)
+    return cast(ByteArray, pixels) if pixels.dtype == np.uint8 else _eight_bits(pixels)
 
 
 def _to_bgr(pixels: AnyArray, kind: str, pattern: str | None) -> ByteArray:
     if kind == "bayer":
-        return cv2.cvtColor(np.ascontiguousarray(pixels), _BAYER_TO_BGR[str(pattern)])
+        return cast(ByteArray, cv2.cvtColor(np.ascontiguousarray(pixels), _BAYER_TO_BGR[str(pattern)]))
     if kind == "rgb":
-        return cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
+        return cast(ByteArray, cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR))
     return np.ascontiguousarray(pixels)
 
 

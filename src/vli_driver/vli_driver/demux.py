@@ -92,9 +92,9 @@ class BrightnessLevels:
 class Demultiplexer:
     """Sorts frames into :class:`Exposure` as they come; ``Image.laser_on``, where known, decides alone.
 
-    Counters: ``long``, ``short``, ``missing`` (periods without a frame), ``duplicate``, ``out_of_order``, ``clock_jump``, ``phase_swap``,
-    ``dark_long`` (a long frame as dark as a short one), ``ambient_light`` (a short frame as bright as a long one: dropped), ``unclear``
-    (neither brightness nor rhythm tells: dropped).
+    Counters: ``long``, ``short``, ``missing`` (periods without a frame), ``duplicate``, ``out_of_order``, ``clock_jump``,
+    ``phase_swap``, ``dark_long`` (a long frame as dark as a short one), ``ambient_light`` (a short frame as bright as a long one:
+    dropped), ``unclear`` (neither brightness nor rhythm tells: dropped).
 
     Args:
         config: see :class:`DemuxConfig`.

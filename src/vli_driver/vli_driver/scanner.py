@@ -22,7 +22,9 @@ class StripeScanner:
         CalibrationError: there is no laser plane, or it cannot be seen within its range.
     """
 
-    def __init__(self, calibration: Calibration, config: StripeConfig | None = None, detector: StripeDetector | None = None) -> None:
+    def __init__(
+        self, calibration: Calibration, config: StripeConfig | None = None, detector: StripeDetector | None = None
+    ) -> None:
         config = config or StripeConfig()
         self.counters = Counters()
         self._camera = calibration.camera
@@ -46,7 +48,9 @@ class StripeScanner:
             self.counters.add("empty")
             return LaserScan.empty(short.stamp_ns, short.session)
         self.counters.add("scans")
-        return LaserScan(short.stamp_ns, points[valid], stripe.pixels[valid], stripe.intensity[valid], sigma[valid], short.session)
+        return LaserScan(
+            short.stamp_ns, points[valid], stripe.pixels[valid], stripe.intensity[valid], sigma[valid], short.session
+        )
 
     def _check_size(self, image: Image) -> None:
         height, width = image.pixels.shape[:2]

@@ -38,9 +38,9 @@ class Shot:
 class Sequencer:
     """Triggers the camera ``rate_hz`` times a second, long and short in turn.
 
-    The kind of a shot belongs to its slot, the count of periods since the start: a tick that comes too late or not at all leaves its
-    slot empty, and what follows is what it would have been. The kind of an image is that of the shot that it matches in time, not that
-    of the shot before: an image that is lost shifts nothing.
+    The kind of a shot belongs to its slot, the count of periods since the start: a tick that comes too late or not at all
+    leaves its slot empty, and what follows is what it would have been. The kind of an image is that of the shot that it matches
+    in time, not that of the shot before: an image that is lost shifts nothing.
 
     Counters: ``triggered``, ``missed_slots``, ``lost_images``, ``unknown_images``.
 
@@ -86,7 +86,8 @@ class Sequencer:
         """Return the shot of an image; None for an image that was not asked for.
 
         Args:
-            closed_ns: when its shutter closed as far as the camera tells: its own stamp, or the arrival less the usual delay; right to
+            closed_ns: when its shutter closed as far as the camera tells: its own stamp, or the arrival less the usual
+                delay; right to
                 half a period.
         """
         while self._shots and closed_ns > self._shots[0].end_ns + self._period_ns // 2:
@@ -118,5 +119,7 @@ class Sequencer:
 
 def _period_ns(rate_hz: float, exposure_s: float) -> int:
     if not rate_hz > 0 or not 0 < exposure_s < 1 / rate_hz:
-        raise ConfigError([f"exposure of '{exposure_s}' s at '{rate_hz}' frames/s, expected more than 0 s and less than the period"])
+        raise ConfigError(
+            [f"exposure of '{exposure_s}' s at '{rate_hz}' frames/s, expected more than 0 s and less than the period"]
+        )
     return round(NANOSECONDS / rate_hz)

@@ -1,12 +1,13 @@
 """The laser stripe in a short frame, to a fraction of a pixel.
 
-Background off, smoothed peak, centre of mass over a window that fits the line, nothing rounded: see ``docs/tuning`` for the choice.
+Background off, smoothed peak, centre of mass over a window that fits the line, nothing rounded. Where an edge or a glow makes
+the line lean, what is left of it is off: such points are dropped, and what lean remains is in their sigma.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, cast
 
 import cv2
 import numpy as np
@@ -99,10 +100,10 @@ class CentreOfMassDetector:
     def _profiles(self, pixels: ByteArray) -> ByteArray:
         """Return the band as profiles (N, M, C), contiguous."""
         if self.config.channel == "grey" and pixels.ndim == 3:
-            pixels = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY)
+            pixels = cast(ByteArray, cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY))
         stop = self.band.stop + _PAD
         if self.band.along_columns:
-            band = cv2.transpose(pixels[self._start : stop])
+            band = cast(ByteArray, cv2.transpose(pixels[self._start : stop]))
         else:
             band = np.ascontiguousarray(pixels[:, self._start : stop])
         return band if band.ndim == 3 else band[:, :, None]

@@ -1,6 +1,7 @@
 """Inner loops of the stripe detector.
 
-A *profile* is one image column (or row) across the stripe; ``profiles`` is (N, M, C) uint8: N profiles of M samples in C channels.
+A *profile* is one image column (or row) across the stripe; ``profiles`` is (N, M, C) uint8: N profiles of M samples in C
+channels.
 """
 
 from __future__ import annotations
@@ -137,7 +138,7 @@ def _extent(line, peak, level):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, fastmath=True)
 def _background(line):  # type: ignore[no-untyped-def]
-    """Return the mean of every eighth sample that does not exceed the mean of all of them: the stripe and bright patches are out."""
+    """Return the mean of every eighth sample not above the mean of all of them: the stripe and bright patches are out."""
     total, count = 0.0, 0
     for j in range(0, len(line), _BACKGROUND_STEP):
         total += line[j]
@@ -171,8 +172,8 @@ def find_peaks(smoothed, first, last, threshold, ambiguity, max_width):  # type:
         max_width: pixels, peaks that seem wider are measured above the surface that they stand on.
 
     Returns:
-        (N, 2, 4) float64: low and high end of the peak at half height, the height, the middle of the ends at a quarter of it; height
-        zero where there is none.
+        (N, 2, 4) float64: low and high end of the peak at half height, the height, the middle of the ends at a quarter of it;
+        height zero where there is none.
     """
     found = np.zeros((len(smoothed), CANDIDATES, 4))
     for i in range(len(smoothed)):
@@ -205,7 +206,7 @@ def _second(line, begin, end, low, high, floor):  # type: ignore[no-untyped-def]
     below = _highest(line, begin, max(int(low) - 1, begin), floor)
     above = _highest(line, min(int(high) + 2, end), end, floor)
     peak = above if below < 0 or (above >= 0 and line[above] > line[below]) else below
-    if peak > 0 and line[peak - 1] > line[peak] or 0 <= peak < len(line) - 1 and line[peak + 1] > line[peak]:
+    if (peak > 0 and line[peak - 1] > line[peak]) or (0 <= peak < len(line) - 1 and line[peak + 1] > line[peak]):
         return -1
     return peak
 
@@ -282,8 +283,9 @@ def locate(profiles, channel, peaks, smoothing, noise, threshold, window_sigmas,
         max_width: pixels, wider peaks are no laser line.
 
     Returns:
-        (N, 8) float64: centre, peak I, Σ I, Σ k² var(I_k) of sensor noise, Σ k² I_k² for speckle (k from the centre), Σ I of the other
-        channels' mean, lean (centre less the middle at a quarter of the height, as a share of the width), width; NaN where there is no line.
+        (N, 8) float64: centre, peak I, Σ I, Σ k² var(I_k) of sensor noise, Σ k² I_k² for speckle (k from the centre), Σ I of
+        the other channels' mean, lean (centre less the middle at a quarter of the height, as a share of the width), width; NaN
+        where there is no line.
     """
     out = np.full((len(peaks), 8), np.nan)
     for i in range(len(peaks)):
@@ -394,7 +396,7 @@ def keep_segments(located, ambiguous, max_jump, min_points, min_colour_ratio):  
 
 @njit(cache=True)
 def trim_segments(located, keep, max_jump, trim, min_points):  # type: ignore[no-untyped-def]
-    """Clear the first and last ``trim`` points of every segment, where an edge cuts the line, and segments that became too short."""
+    """Clear the first and last ``trim`` points of every segment, where an edge cuts the line, and segments too short by now."""
     i = 0
     while i < len(located):
         if not keep[i]:

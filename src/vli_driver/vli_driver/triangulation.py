@@ -59,7 +59,10 @@ def search_band(calibration: Calibration, along_columns: bool, margin: float) ->
     if not profiles.any():
         raise CalibrationError(
             "laser0",
-            [f"the laser plane is nowhere in the image at 'range_m' {list(laser.range_m)}; re-run 'vli calibrate laser' or correct range_m"],
+            [
+                f"the laser plane is nowhere in the image at 'range_m' {list(laser.range_m)}; re-run 'vli "
+                f"calibrate laser' or correct range_m"
+            ],
         )
     seen = profiles.any(axis=1)
     first = np.where(seen, profiles.argmax(axis=1), 0)

@@ -43,7 +43,9 @@ def compressed(ns: int, form: str = "jpeg", suffix: str = ".jpg", pixels: np.nda
 def imu(ns: int) -> Any:
     vector, zeros = T["geometry_msgs/msg/Vector3"], np.zeros(9)
     orientation = T["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
-    return T["sensor_msgs/msg/Imu"](header(ns), orientation, zeros, vector(0.1, 0.2, ns * 1e-9), zeros, vector(1.0, 2.0, 9.8), zeros)
+    return T["sensor_msgs/msg/Imu"](
+        header(ns), orientation, zeros, vector(0.1, 0.2, ns * 1e-9), zeros, vector(1.0, 2.0, 9.8), zeros
+    )
 
 
 def exposure(ns: int, laser: str) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+
 from vli_common.arrays import ByteArray, FloatArray
 
 READ_NOISE = 2.0
@@ -31,7 +32,11 @@ def light(line: Line, centres: FloatArray, height: int, rng: np.random.Generator
 
 def expose(light: FloatArray, rng: np.random.Generator) -> ByteArray:
     """Return what an 8-bit sensor makes of light in grey levels."""
-    noisy = light + np.sqrt(SHOT_GAIN * np.maximum(light, 0)) * rng.normal(size=light.shape) + READ_NOISE * rng.normal(size=light.shape)
+    noisy = (
+        light
+        + np.sqrt(SHOT_GAIN * np.maximum(light, 0)) * rng.normal(size=light.shape)
+        + READ_NOISE * rng.normal(size=light.shape)
+    )
     return np.clip(np.round(noisy), 0, 255).astype(np.uint8)
 
 

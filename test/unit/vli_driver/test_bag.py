@@ -11,6 +11,7 @@ import pytest
 import recordings as rec
 from mcap.writer import CompressionType
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
+
 from vli_common.errors import InputError
 from vli_common.types import EncodedImage, ImuSample
 from vli_driver.bag import BagReader, BagTopics
@@ -93,7 +94,9 @@ def test_the_exposure_topic_is_folded_into_the_images_whichever_is_logged_first(
     messages = list(rec.standard())
     for k in range(rec.IMAGES - 1):  # the last image never gets its note
         stamp = rec.START_NS + k * rec.IMAGE_NS
-        messages.append((stamp + (3_000_000 if k % 3 else -3_000_000), "/camera/exposure", rec.exposure(stamp, "on" if k % 2 else "off")))
+        messages.append(
+            (stamp + (3_000_000 if k % 3 else -3_000_000), "/camera/exposure", rec.exposure(stamp, "on" if k % 2 else "off"))
+        )
     messages.sort(key=lambda item: item[0])
     reader = BagReader(rec.write_mcap(tmp_path / "a.mcap", messages))
     items = list(reader)
@@ -147,7 +150,10 @@ def test_the_compressed_stream_of_the_same_camera_is_no_second_camera(tmp_path: 
 
 
 def test_a_compressed_stream_serves_where_there_is_no_raw_one(tmp_path: Path) -> None:
-    messages = [(rec.START_NS, "/camera/image_raw/compressed", rec.compressed(rec.START_NS)), (rec.START_NS, "/imu", rec.imu(rec.START_NS))]
+    messages = [
+        (rec.START_NS, "/camera/image_raw/compressed", rec.compressed(rec.START_NS)),
+        (rec.START_NS, "/imu", rec.imu(rec.START_NS)),
+    ]
     reader = BagReader(rec.write_mcap(tmp_path / "a.mcap", messages))
     image = reader.first_image()
     assert image is not None

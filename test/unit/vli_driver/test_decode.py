@@ -5,6 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
+
 from vli_common.arrays import AnyArray, ByteArray
 from vli_common.errors import InputError
 from vli_common.types import EncodedImage

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
 from vli_common.types import Exposure, Image
 from vli_driver.brightness import brightness
 from vli_driver.demux import Demultiplexer
@@ -67,7 +68,9 @@ def test_after_one_lost_image_every_frame_is_still_right(dropped: int) -> None:
 @pytest.mark.parametrize("slipped", [50, 51])
 def test_when_long_and_short_swap_places_without_a_gap_the_rhythm_is_found_again(slipped: int) -> None:
     frames = stream()
-    kept = frames[:slipped] + [(exposure, replace(image, stamp_ns=image.stamp_ns - PERIOD_NS)) for exposure, image in frames[slipped + 1 :]]
+    kept = frames[:slipped] + [
+        (exposure, replace(image, stamp_ns=image.stamp_ns - PERIOD_NS)) for exposure, image in frames[slipped + 1 :]
+    ]
     out, demultiplexer = sort(kept)
     assert wrong(out, kept) == []
     assert len(out) == len(kept)
@@ -110,7 +113,10 @@ def test_a_flash_in_a_short_frame_costs_that_frame_only() -> None:
 
 @pytest.mark.parametrize("factor", [0.25, 0.5, 2.0, 3.5])
 def test_a_brightness_step_of_the_long_frames_loses_none(factor: float) -> None:
-    frames = [(exposure, frame(k, exposure, int(70 * factor)) if exposure is LONG and k > 80 else image) for k, (exposure, image) in enumerate(stream())]
+    frames = [
+        (exposure, frame(k, exposure, int(70 * factor)) if exposure is LONG and k > 80 else image)
+        for k, (exposure, image) in enumerate(stream())
+    ]
     out, _ = sort(frames)
     assert out == frames
 
@@ -132,7 +138,7 @@ def test_after_a_long_gap_brightness_alone_finds_the_rhythm() -> None:
 
 def test_duplicates_and_late_images_are_dropped_and_counted() -> None:
     frames = stream()
-    shuffled = frames[:60] + [frames[61], frames[60], frames[61]] + frames[62:]
+    shuffled = [*frames[:60], frames[61], frames[60], frames[61], *frames[62:]]
     out, demultiplexer = sort(shuffled)
     assert out == frames[:60] + frames[61:]
     assert (demultiplexer.counters["duplicate"], demultiplexer.counters["out_of_order"]) == (1, 1)
@@ -169,7 +175,10 @@ def test_a_laser_that_starts_late_is_noticed_within_a_second() -> None:
 
 def test_what_the_exposure_topic_says_is_believed() -> None:
     # So little contrast that brightness and rhythm would call it all long.
-    frames = [(exposure, replace(frame(k, LONG, 60 + (exposure is LONG)), laser_on=exposure is SHORT)) for k, (exposure, _) in enumerate(stream(60))]
+    frames = [
+        (exposure, replace(frame(k, LONG, 60 + (exposure is LONG)), laser_on=exposure is SHORT))
+        for k, (exposure, _) in enumerate(stream(60))
+    ]
     del frames[20]
     assert sort(frames)[0] == frames
 

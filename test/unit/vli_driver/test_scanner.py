@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from stripes import Line, colour_image
+
 from vli_common.arrays import FloatArray
 from vli_common.calibration import Calibration, LaserCalibration
 from vli_common.camera import make_camera
@@ -147,5 +148,5 @@ def test_a_laser_that_cannot_be_seen_within_its_range_is_refused() -> None:
 
 def test_a_calibration_without_laser_is_refused() -> None:
     calib = calibration()
-    with pytest.raises(CalibrationError, match="laser0.*section is missing"):
+    with pytest.raises(CalibrationError, match=r"laser0.*section is missing"):
         StripeScanner(Calibration(calib.camera, 60.0, None, 0, None, None), StripeConfig())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+
 from vli_common.errors import ConfigError
 from vli_common.types import Exposure
 from vli_driver.sequencer import Sequencer, Shot
@@ -46,7 +47,9 @@ def test_the_recorder_is_what_the_protocols_ask_for(recorder: Recorder) -> None:
     assert isinstance(recorder, LaserSwitch)
 
 
-def test_long_and_short_alternate_and_the_laser_is_switched_before_each_exposure(sequencer: Sequencer, recorder: Recorder) -> None:
+def test_long_and_short_alternate_and_the_laser_is_switched_before_each_exposure(
+    sequencer: Sequencer, recorder: Recorder
+) -> None:
     kinds = [shot_at(sequencer, slot).exposure for slot in range(4)]
     assert kinds == [Exposure.LONG, Exposure.SHORT] * 2
     assert recorder.commands == [("laser", False), ("trigger", 5e-3), ("laser", True), ("trigger", 3e-4)] * 2

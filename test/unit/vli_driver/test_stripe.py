@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from stripes import Line, colour_image, expose, grey_image, light
+
 from vli_common.arrays import ByteArray, FloatArray
 from vli_driver.config import StripeConfig
 from vli_driver.stripe import CentreOfMassDetector, StripePoints
@@ -56,7 +57,9 @@ def test_the_error_of_a_point_is_that_of_the_best_known_detectors(line: Line, bo
     assert abs(error.mean()) <= 0.06 * bound_px + 0.003
 
 
-@pytest.mark.parametrize("line", [Line(sigma=1.0), Line(peak=40.0), Line(peak=800.0), Line(sigma=2.5, speckle=0.3), Line(background=60.0)])
+@pytest.mark.parametrize(
+    "line", [Line(sigma=1.0), Line(peak=40.0), Line(peak=800.0), Line(sigma=2.5, speckle=0.3), Line(background=60.0)]
+)
 def test_the_sigma_of_a_point_tells_its_error(line: Line) -> None:
     centres = wavy()
     stripe = detect(grey_image(line, centres))
