@@ -14,6 +14,7 @@ from vli_bringup.map_metrics import CompletenessFigures, SurfaceFigures
 from vli_bringup.trajectory_metrics import TrajectoryFigures
 
 Value = float | int | None
+_HUGE = 1e5
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +80,7 @@ def _table_1(evaluation: Evaluation) -> str:
 
     rows = [
         row("translation RMSE / max, mm", ("51 / 86", "3.9 / 8.6", "3.2 / 6.0"),
-            lambda f: f"{f.translation_rmse_mm:.3f} / {f.translation_max_mm:.3f}"),
+            lambda f: f"{_text(f.translation_rmse_mm, '.3f')} / {_text(f.translation_max_mm, '.3f')}"),
         row("translation drift, %", ("4.6", "0.46", "0.32"), lambda f: _text(f.drift_percent, ".3f")),
         row("absolute, per pass, %", ("23.7", "0.65", "–"), lambda f: _text(f.absolute_drift_percent, ".3f")),
         row("rotation RMSE / max, rad", (".022 / .030", ".014 / .033", ".023 / .035"),
@@ -121,7 +122,10 @@ def _further(figures: Mapping[str, Value]) -> str:
 
 
 def _text(value: Value, form: str, factor: float = 1) -> str:
-    return "–" if value is None else format(value * factor, form)
+    if value is None:
+        return "–"
+    # A trajectory that flew away must not take the table apart.
+    return format(value * factor, form if "," in form or abs(value * factor) < _HUGE else ".1e")
 
 
 def _table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

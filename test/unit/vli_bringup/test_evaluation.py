@@ -181,6 +181,14 @@ def test_the_tables_show_the_papers_values_beside_ours(scan: Path, capsys: pytes
     assert (scan / "run" / "eval" / "report.md").read_text() == text
 
 
+def test_a_trajectory_that_flew_away_does_not_take_the_tables_apart(scan: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    away = moved(disturbed(part(wavy(), slice(40, None, 2)), 1), T_MAP_TRUTH, 1e15)
+    for name in ("trajectory.tum", "trajectory_final.tum"):
+        write_tum(scan / "run" / name, away)
+    assert evaluate(scan) == 0
+    assert max(len(line) for line in capsys.readouterr().out.splitlines()) < 130
+
+
 def test_the_json_file_has_every_figure_under_a_flat_key_and_null_for_what_is_not_known(scan: Path) -> None:
     figures = figures_of(scan)
     assert evaluate(scan, "--json", str(scan / "figures.json")) == 0
