@@ -12,14 +12,14 @@ class BackEndConfig:
     """Window, residual sigmas and state machine. Every residual is in units of its measured sigma."""
 
     window_keyframes: int = parameter(
-        8, unit="keyframes", minimum=4, maximum=20, doc="keyframes in the window; more: steadier, slower (5 to 12 measure alike)"
+        10, unit="keyframes", minimum=4, maximum=20, doc="keyframes in the window (the paper has 8); more: steadier, slower"
     )
     pixel_sigma: float = parameter(
-        0.5,
+        0.3,
         unit="px",
         minimum=0.05,
         maximum=5.0,
-        doc="floor of the track sigma, covers what frames share (0.25 to 1 measure alike)",
+        doc="floor of the track sigma, covers what frames share (0.2 to 0.5 measure alike)",
     )
     depth_sigma: float = parameter(
         1.0e-4,
@@ -28,7 +28,7 @@ class BackEndConfig:
         maximum=1.0e-2,
         doc="floor of the laser depth of a feature, eq. (2), at 30 mm; grows with z²",
     )
-    cauchy: float = parameter(1.0, unit="sigma", minimum=0.1, maximum=100.0, doc="where the robust loss starts to turn over")
+    cauchy: float = parameter(0.5, unit="sigma", minimum=0.1, maximum=100.0, doc="where the robust loss starts to turn over")
     iterations: int = parameter(
         4, minimum=1, maximum=50, doc="re-linearisations a keyframe; more: slower, needed only after a start"
     )
