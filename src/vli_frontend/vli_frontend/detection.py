@@ -14,7 +14,7 @@ from vli_frontend.patch_alignment import MARGIN_PX
 
 _BLOCK = 3
 _NEIGHBOURS = np.ones((3, 3), np.uint8)
-_NOISE_RESPONSE = 2e-5
+_NOISE_RESPONSE = 4e-5
 """Corner response of sensor noise on an empty area (OpenCV's scale, half-size image): nothing below is a corner."""
 
 

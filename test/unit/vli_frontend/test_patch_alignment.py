@@ -1,0 +1,100 @@
+"""Alignment of patches under known warps and light."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from planar_scene import texture
+from scipy.ndimage import map_coordinates
+
+from vli_common.arrays import ByteArray, FloatArray
+from vli_frontend.patch_alignment import Aligned, PatchTemplates
+
+POINTS = np.array([[60.0, 70.3], [120.25, 60.75], [100.5, 130.0], [150.8, 149.1]])
+SLOTS = np.array([3, 0, 5, 1])
+IDENTITY = np.tile(np.eye(2), (4, 1, 1))
+
+
+def warped(pattern: ByteArray, affine: FloatArray, shift: FloatArray, light: FloatArray | float = 1.0) -> ByteArray:
+    """Return the image in which the content at x appears at ``affine`` x + ``shift``."""
+    height, width = pattern.shape
+    back = np.linalg.inv(affine)
+    y, x = np.mgrid[:height, :width].astype(np.float64)
+    source = np.stack([x - shift[0], y - shift[1]], axis=-1) @ back.T
+    # A spline: OpenCV's cubic kernel shifts the picture by up to 0.05 px.
+    values = map_coordinates(pattern.astype(np.float64), [source[..., 1], source[..., 0]], order=5, mode="nearest")
+    return np.clip(np.round(values * light), 0, 255).astype(np.uint8)
+
+
+def align(first: ByteArray, second: ByteArray, start: FloatArray) -> Aligned:
+    templates = PatchTemplates(6)
+    templates.create(first, SLOTS, POINTS)
+    assert templates.valid[SLOTS].all()
+    return templates.align(second, SLOTS, start, IDENTITY)
+
+
+@pytest.fixture(scope="module")
+def pattern() -> ByteArray:
+    return cv2.GaussianBlur(texture(size=220), (3, 3), 0)
+
+
+def test_a_shift_is_found_to_a_few_hundredths_of_a_pixel(pattern: ByteArray) -> None:
+    shift = np.array([1.37, -0.82])
+    found = align(pattern, warped(pattern, np.eye(2), shift), POINTS + np.round(shift))
+    assert found.converged.all()
+    np.testing.assert_allclose(found.pixels, POINTS + shift, atol=0.03)
+    assert found.correlation.min() > 0.99
+
+
+def test_an_affine_warp_is_found_with_its_position(pattern: ByteArray) -> None:
+    affine, shift = np.array([[1.06, 0.05], [-0.04, 0.97]]), np.array([-7.3, 6.1])
+    truth = POINTS @ affine.T + shift
+    found = align(pattern, warped(pattern, affine, shift), truth + np.array([0.6, -0.5]))
+    assert found.converged.all()
+    np.testing.assert_allclose(found.pixels, truth, atol=0.03)
+    np.testing.assert_allclose(found.affine, np.tile(affine, (4, 1, 1)), atol=0.01)
+
+
+def test_a_gain_that_slopes_across_the_patch_does_not_pull_the_position(pattern: ByteArray) -> None:
+    slope = np.linspace(1.3, 0.5, pattern.shape[1])[None]
+    found = align(pattern, warped(pattern, np.eye(2), np.zeros(2), slope), POINTS + np.array([0.4, 0.3]))
+    assert found.converged.all()
+    np.testing.assert_allclose(found.pixels, POINTS, atol=0.03)
+
+
+def test_another_patch_is_told_by_its_correlation(pattern: ByteArray) -> None:
+    found = align(pattern, cv2.GaussianBlur(texture(seed=9, size=220), (3, 3), 0), POINTS)
+    assert not (found.converged & (found.correlation > 0.8)).any()
+
+
+def test_where_nothing_is_found_the_start_stays(pattern: ByteArray) -> None:
+    found = align(pattern, np.full_like(pattern, 90), POINTS + 0.25)
+    assert not found.converged.any()
+    np.testing.assert_array_equal(found.pixels, POINTS + 0.25)
+
+
+def test_a_patch_without_texture_is_no_template() -> None:
+    templates = PatchTemplates(2)
+    ramp = np.tile(np.arange(0, 220, dtype=np.uint8), (220, 1))
+    templates.create(np.full((220, 220), 77, np.uint8), np.array([0]), POINTS[:1])
+    templates.create(ramp, np.array([1]), POINTS[:1])
+    assert not templates.valid.any()
+    assert np.isinf(templates.sigma_per_level).all()
+    found = templates.align(ramp, np.array([0, 1]), POINTS[:2], IDENTITY[:2])
+    assert not found.converged.any()
+
+
+def test_the_bound_on_the_position_predicts_its_scatter_under_noise(pattern: ByteArray) -> None:
+    templates = PatchTemplates(6)
+    templates.create(pattern, SLOTS, POINTS)
+    rng = np.random.default_rng(1)
+    noise, errors = 3.0, []
+    for _ in range(60):
+        noisy = np.clip(pattern + noise * rng.standard_normal(pattern.shape), 0, 255).round().astype(np.uint8)
+        errors.append(templates.align(noisy, SLOTS, POINTS, IDENTITY).pixels - POINTS)
+    measured = np.sqrt((np.array(errors) ** 2).mean(axis=(0, 2)))
+    # Bilinear sampling averages the noise: the bound of white noise is an upper one here.
+    predicted = noise * templates.sigma_per_level[SLOTS]
+    assert np.all(measured < 1.1 * predicted)
+    assert np.all(measured > 0.4 * predicted)
