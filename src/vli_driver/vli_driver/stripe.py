@@ -15,6 +15,7 @@ import numpy as np
 from vli_common.arrays import AnyArray, BoolArray, ByteArray, Float32Array, FloatArray, IntArray
 from vli_common.types import Counters
 from vli_driver import stripe_kernels as kernels
+from vli_driver import stripe_segments as segments
 from vli_driver.config import StripeConfig
 from vli_driver.triangulation import SearchBand
 
@@ -84,17 +85,17 @@ class CentreOfMassDetector:
         found = kernels.find_peaks(
             self._smoothed(profiles, channel), self._first, self._last, threshold, config.ambiguity, config.max_width_px
         )
-        peaks, ambiguous = kernels.choose_chain(found, config.max_jump_px)
+        peaks, ambiguous = segments.choose_chain(found, config.max_jump_px)
         located = kernels.locate(
             profiles, channel, peaks, config.smoothing_px, noise, threshold, config.window_sigmas, config.max_width_px
         )
         ratio = config.min_colour_ratio if profiles.shape[2] > 1 else 0.0
-        keep = kernels.keep_segments(located, ambiguous, config.max_jump_px, config.min_segment_points, ratio)
+        keep = segments.keep_segments(located, ambiguous, config.max_jump_px, config.min_segment_points, ratio)
         sigma_px = self._sigma_px(located, keep)
-        lean_px = kernels.steady_lean(located, keep) * located[:, 7]
+        lean_px = segments.steady_lean(located, keep) * located[:, 7]
         # Speckle and noise make the median of nine neighbours lean by less than half a sigma.
         keep &= np.abs(lean_px) <= np.maximum(config.max_lean * located[:, 7], sigma_px)
-        kernels.trim_segments(located, keep, config.max_jump_px, config.trim_points, config.min_segment_points)
+        segments.trim_segments(located, keep, config.max_jump_px, config.trim_points, config.min_segment_points)
         return self._points(located, np.hypot(sigma_px, _LEAN_BIAS * lean_px), np.flatnonzero(keep))
 
     def _profiles(self, pixels: ByteArray) -> ByteArray:
