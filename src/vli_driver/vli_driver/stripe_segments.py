@@ -1,6 +1,6 @@
 """Peaks of neighbouring profiles to segments of one line.
 
-``found`` and ``located`` are what :mod:`vli_driver.stripe_kernels` gives: peaks, and points with their measures, one row a profile.
+``found`` and ``located`` are what :mod:`vli_driver.stripe_kernels` gives, peaks and points with their measures, a row a profile.
 """
 
 from __future__ import annotations
