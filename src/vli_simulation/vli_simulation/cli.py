@@ -13,7 +13,7 @@ import yaml
 from tqdm import tqdm
 
 from vli_common.errors import OutputError
-from vli_simulation.config import PRESETS, make_config
+from vli_simulation.config import PRESETS, SimulationError, make_config
 from vli_simulation.scenes import SCENES
 from vli_simulation.simulate import Simulation, write_recording
 
@@ -61,6 +61,10 @@ def run(args: argparse.Namespace) -> int:
         SimulationError, ConfigError: what was asked for is impossible.
     """
     config = make_config(args.preset, _overrides(args))
+    if args.seed < 0 or (args.workers is not None and args.workers < 1):
+        raise SimulationError(
+            f"--seed '{args.seed}' or --workers '{args.workers}' is out of range, expected at least 0 and at least 1"
+        )
     _refuse_to_overwrite(args.out, args.overwrite)
     start = time.monotonic()
     simulation = Simulation(args.scene, config, args.seed)

@@ -138,6 +138,7 @@ def test_an_existing_directory_is_kept_unless_told_otherwise(tmp_path: Path) -> 
         (("--set", "sensor.specle=1"), ConfigError, "unknown parameter 'sensor.specle', did you mean 'sensor.speckle'"),
         (("--distance", "0.5"), ConfigError, "'motion.distance' is '0.5', expected 0.015 to 0.15 m"),
         (("--resolution", "640"), ConfigError, "'rig.height' is 'None', expected an integer"),
+        (("--seed", "-1"), SimulationError, "--seed '-1' or --workers 'None' is out of range"),
         (("--duration", "60"), SimulationError, "is longer than the scene"),
     ],
 )
