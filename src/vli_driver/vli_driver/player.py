@@ -12,6 +12,8 @@ from vli_common.config import parameter
 from vli_common.types import NANOSECONDS, Counters, EncodedImage, ImuSample
 
 _LATE_S = 0.1
+_GAP_NS = 10 * NANOSECONDS
+"""Longer steps, between streams too, are none of time: nobody waits for them."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,7 @@ class BagPlayer:
             self._running.wait()
             self._anchor = None
         now_s = self._clock()
-        if self._anchor is None:
+        if self._anchor is None or abs(stamp_ns - self.position_ns) > _GAP_NS:
             self._anchor = (now_s, stamp_ns)
         due_s = self._anchor[0] + (stamp_ns - self._anchor[1]) / NANOSECONDS / self._rate
         self.counters.add("late", int(now_s - due_s > _LATE_S))

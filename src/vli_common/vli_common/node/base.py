@@ -25,7 +25,7 @@ from vli_common.calibration import Calibration, load_calibration, parse_calibrat
 from vli_common.errors import CalibrationError, MessageError, VliError
 from vli_common.messages import Session, session_from_message, session_to_message, status_from_message, status_to_message
 from vli_common.node.parameters import NodeConfig, NodeParameters
-from vli_common.node.transport import message_type, quality
+from vli_common.node.transport import message_type, pending, quality
 from vli_common.node.worker import Worker
 from vli_common.status import Health, LatencyMeter, NodeState, RateMeter, StageStatus
 from vli_common.topics import CALIBRATION, DIAGNOSTICS, NAMESPACE, SESSION, STATUS, Topic
@@ -148,11 +148,16 @@ class VliNode(Node):
         entry = _Input(topic, name or topic.name, ends, required)
         limit = _QUEUE_DEPTHS * topic.depth
 
-        def callback(message: Any) -> None:
+        def accept(message: Any) -> None:
             entry.rate.add()
             entry.received += 1
             entry.last_s = time.monotonic()
             self._worker.put(topic.name, partial(self._process, entry, read, handle, message, entry.last_s), limit)
+
+        def callback(message: Any) -> None:
+            accept(message)
+            for further in pending(entry.subscription):
+                accept(further)
 
         entry.subscription = self.create_subscription(message_type(topic), entry.name, callback, quality(topic, reading=True))
         self._inputs[topic.name] = entry

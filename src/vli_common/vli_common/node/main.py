@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import time
 from collections.abc import Callable
 
 import rclpy
@@ -16,6 +17,8 @@ from vli_common.node.transport import set_transport_profile
 _SWITCH_S = 2e-4
 """The executor asks for the interpreter for every message. At Python's default of 5 ms, 260 messages a second would take longer
 than a second while the worker computes."""
+_REST_S = 2e-3
+"""What comes in this time is taken in one round of the executor; see :func:`vli_common.node.transport.pending`."""
 _UNUSABLE = 2
 _FAILED = 1
 
@@ -36,7 +39,9 @@ def run_node(factory: Callable[[], VliNode]) -> int:
         node.start()
         executor = SingleThreadedExecutor()
         executor.add_node(node)
-        executor.spin()
+        while True:
+            executor.spin_once()
+            time.sleep(_REST_S)
     except (KeyboardInterrupt, ExternalShutdownException):
         pass
     except VliError as error:
