@@ -1,0 +1,186 @@
+"""The node graph, in processes: each node starts and stops cleanly, nothing is lost between them, and a failure is told."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_bag import TinyBag, write_calibration
+
+from vli_bringup.cli import main
+from vli_bringup.graph import NodeDescription, Playback, describe_graph
+from vli_bringup.listener import GraphListener
+from vli_bringup.processes import GraphError, NodeProcesses
+from vli_bringup.recorder import Recorder
+from vli_bringup.settings import Settings, to_yaml
+from vli_common.calibration import load_calibration
+from vli_common.geometry import align
+from vli_common.status import NodeState
+
+pytestmark = pytest.mark.graph
+
+NODES = [node.executable for node in describe_graph(Path("none"))]
+_START_S = 240.0
+
+
+@pytest.fixture(scope="module", autouse=True)
+def own_domain() -> Iterator[None]:
+    """Keep apart from whatever else speaks ROS on this machine."""
+    patch = pytest.MonkeyPatch()
+    patch.setenv("ROS_DOMAIN_ID", str(random.randint(100, 200)))
+    yield
+    patch.undo()
+
+
+@pytest.fixture
+def calibration(tmp_path: Path) -> Path:
+    return write_calibration(tmp_path / "calibration.yaml")
+
+
+@pytest.fixture
+def parameter_file(tmp_path: Path) -> Path:
+    path = tmp_path / "vli.yaml"
+    path.write_text(to_yaml(Settings()))
+    return path
+
+
+@pytest.fixture
+def listener(calibration: Path) -> Iterator[GraphListener]:
+    with GraphListener(Recorder(load_calibration(calibration))) as item:
+        yield item
+
+
+def wait(listener: GraphListener, condition: Callable[[], bool], timeout_s: float = _START_S) -> None:
+    deadline_s = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline_s, listener.statuses
+        listener.spin()
+
+
+def command(executable: str, *parameters: str) -> list[str]:
+    (node,) = [node for node in describe_graph(Path("none")) if node.executable == executable]
+    arguments = [argument for parameter in parameters for argument in ("-p", parameter)]
+    return [sys.executable, "-m", node.module, "--ros-args", *arguments]
+
+
+@pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM])
+def test_every_node_started_singly_stops_cleanly_on_a_signal(listener: GraphListener, sign: signal.Signals) -> None:
+    processes = {name: subprocess.Popen(command(name), stderr=subprocess.PIPE) for name in NODES}
+    try:
+        wait(listener, lambda: set(NODES) <= set(listener.statuses))
+        assert listener.state("frontend_node") is NodeState.WAITING
+        assert "calibration_file" in listener.statuses["frontend_node"].hint
+        for process in processes.values():
+            process.send_signal(sign)
+        results = {name: (process.communicate(timeout=20)[1], process.returncode) for name, process in processes.items()}
+        assert results == dict.fromkeys(NODES, (b"", 0))
+    finally:
+        for process in processes.values():
+            process.kill()
+
+
+@pytest.mark.parametrize(
+    ("executable", "parameter", "complaint"),
+    [
+        ("demux_node", "stripe.min_snr:=1.0", "'stripe.min_snr' is '1.0', expected 3.0 to 50.0"),
+        ("frontend_node", "no_such_thing:=1", "unknown parameter 'no_such_thing', did you mean '"),
+        ("backend_node", "mode:=vlsi", "'mode' is 'vlsi', expected one of vli-slam, vli-odom, vi, vl"),
+        (
+            "mapping_node",
+            "calibration_file:=none.yaml",
+            "calibration 'none.yaml': no such file; make one with 'vli calibrate camera",
+        ),
+        ("driver_node", "bag:=none", "bag 'none' does not exist"),
+    ],
+)
+def test_a_node_that_cannot_start_says_why_in_one_line(executable: str, parameter: str, complaint: str) -> None:
+    result = subprocess.run(command(executable, parameter), capture_output=True, text=True, timeout=_START_S, check=False)
+    assert complaint in result.stderr
+    assert result.stderr.count("\n") == 1
+    assert result.returncode == 2
+
+
+def test_a_reset_begins_a_new_session_in_every_node(
+    tmp_path: Path, calibration: Path, parameter_file: Path, listener: GraphListener
+) -> None:
+    with NodeProcesses(describe_graph(calibration), parameter_file) as processes:
+        wait(listener, lambda: all(listener.state(name) is NodeState.READY for name in NODES))
+        processes.check()
+        for number, name in enumerate(["mapping_node", "demux_node"], start=1):
+            assert listener.call(f"{name}/reset", 10.0) == f"session {number}"
+            wait(listener, lambda number=number: all(listener.value(node, "session") == number for node in NODES), 10.0)
+        listener.call("frontend_node/pause", 10.0)
+        wait(listener, lambda: listener.state("frontend_node") is NodeState.PAUSED, 10.0)
+        listener.call("frontend_node/resume", 10.0)
+        wait(listener, lambda: listener.state("frontend_node") is NodeState.READY, 10.0)
+        with pytest.raises(GraphError, match="the map is empty"):
+            listener.call("mapping_node/save", 10.0)
+        pids = processes.pids
+    assert not any(Path(f"/proc/{pid}").exists() for pid in pids.values())
+
+
+def test_a_node_that_dies_is_told_and_none_is_left_behind(calibration: Path, parameter_file: Path) -> None:
+    with NodeProcesses(describe_graph(calibration), parameter_file) as processes:
+        pids = processes.pids
+        os.kill(pids["demux_node"], signal.SIGKILL)
+        time.sleep(0.5)
+        with pytest.raises(GraphError, match="demux_node ended with code '-9'"):
+            processes.check()
+    assert not any(Path(f"/proc/{pid}").exists() for pid in pids.values())
+
+
+def test_the_last_line_of_a_node_that_cannot_start_is_the_error_of_the_graph(tmp_path: Path, parameter_file: Path) -> None:
+    playback = Playback(tmp_path / "none")
+    driver: list[NodeDescription] = describe_graph(write_calibration(tmp_path / "c.yaml"), playback=playback)[:1]
+    with NodeProcesses(driver, parameter_file) as processes:
+        deadline_s = time.monotonic() + _START_S
+        with pytest.raises(GraphError, match="does not exist; expected a rosbag2 directory"):  # noqa: PT012
+            while time.monotonic() < deadline_s:
+                processes.check()
+                time.sleep(0.1)
+
+
+def test_replay_of_noise_passes_every_frame_and_says_that_tracking_never_started(
+    tmp_path: Path, calibration: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = TinyBag().write(tmp_path / "bag")
+    out = tmp_path / "out"
+    assert main(["replay", str(bag), "--calib", str(calibration), "--out", str(out), "--rate", "0.5"]) == 1
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["frames_long"] + summary["frames_short"] == 120
+    assert summary["drops"] == {}
+    assert "tracking never started in 60 long frames: " in capsys.readouterr().err
+    assert (out / "trajectory.tum").read_text() == ""
+
+
+def test_replay_of_a_recording_tracks_and_maps_what_the_scanner_saw(tmp_path: Path, shared_data: Path) -> None:
+    """Half the pace, so that a busy machine drops nothing; the figures at full pace are a matter of test/perf."""
+    recording, out = shared_data / "keyboard_short", tmp_path / "out"
+    options = ["--calib", str(recording / "calibration.yaml"), "--out", str(out), "--duration", "8", "--rate", "0.5"]
+    assert main(["replay", str(recording / "bag"), *options]) == 0
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["drops"] == {}
+    assert summary["frames_with_pose"] >= 0.9 * summary["frames_long"]
+    assert summary["points"] > 10_000
+    assert {path.name for path in out.iterdir()} == {
+        "cloud.png", "config.yaml", "map.ply", "summary.json", "trajectory.tum", "trajectory_final.tum",
+    }  # fmt: skip
+    for name in ("trajectory.tum", "trajectory_final.tum"):
+        assert rmse(np.loadtxt(out / name), np.loadtxt(recording / "truth.tum")) < 3e-4
+
+
+def rmse(estimate: np.ndarray, truth: np.ndarray) -> float:
+    """Return the translation RMSE in metres after alignment, at equal stamps."""
+    nearest = np.abs(truth[:, :1] - estimate[:, 0]).argmin(axis=0)
+    T, _ = align(estimate[:, 1:4], truth[nearest, 1:4])
+    residual = estimate[:, 1:4] @ T[:3, :3].T + T[:3, 3] - truth[nearest, 1:4]
+    return float(np.sqrt((residual**2).sum(axis=1).mean()))
