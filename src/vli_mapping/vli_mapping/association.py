@@ -1,7 +1,7 @@
 """Window-to-map correspondences, eq. (4): Σ w_i ((v_i^g − T v_i) · n_i^g)².
 
-v_i is a point of a scan that is still in the window, v_i^g and n_i^g are centroid and normal of the plane through the map points around
-the one that is nearest to T v_i. Held fixed for a solve: re-searching inside it would make the cost jump.
+v_i is a point of a scan that is still in the window, v_i^g and n_i^g are centroid and normal of the plane through the map points
+around the one that is nearest to T v_i. Held fixed for a solve: re-searching inside it would make the cost jump.
 """
 
 from __future__ import annotations
@@ -12,28 +12,19 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from vli_common.arrays import Float32Array, FloatArray, IntArray
+from vli_common.arrays import AnyArray, Float32Array, FloatArray, IntArray
 from vli_common.geometry import transform
-from vli_common.types import NANOSECONDS, Counters, LaserScan, MapConstraints
+from vli_common.types import NANOSECONDS, Counters, MapConstraints
 from vli_mapping.config import AssociationConfig
+from vli_mapping.insertion import colours_agree, normals_agree
 from vli_mapping.normals import MAX_NEIGHBOURS, fit_plane
-from vli_mapping.point_map import PointMap, colours_agree, normals_agree
+from vli_mapping.point_map import PointMap
+from vli_mapping.scan_window import PosedScan
 from vli_mapping.spatial_hash import bucket_of, cell_of, neighbours
 
 _FULL_SUPPORT = 12.0
 """Map points of a plane from which on more do not make it weigh more."""
 _REASONS = ("matched", "no_map_point", "too_young", "colour_differs", "no_plane", "normal_differs", "gated")
-
-
-@dataclass(frozen=True, slots=True)
-class WindowScan:
-    """A scan in the window: its pose (4, 4), colours (N, 3) float32 and normals in map (N, 3) float32 (0 = none), and its number."""
-
-    scan: LaserScan
-    number: int
-    T_map_camera: FloatArray
-    colours: Float32Array
-    normals: Float32Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +41,12 @@ class _Queries:
 
 
 def associate(
-    point_map: PointMap, scans: Sequence[WindowScan], stamp_ns: int, config: AssociationConfig, counters: Counters, session: int = 0
+    point_map: PointMap,
+    scans: Sequence[PosedScan],
+    stamp_ns: int,
+    config: AssociationConfig,
+    counters: Counters,
+    session: int = 0,
 ) -> MapConstraints | None:
     """Return correspondences of the scans with the map, or None where there are too few to be trusted.
 
@@ -62,7 +58,7 @@ def associate(
         counters: of what became of the points that looked for the map.
         session: of the window.
     """
-    chosen = [_choose(item, config.points_per_scan) for item in scans if len(item.scan)]
+    chosen = [_choose(item, config.points_per_scan) for item in scans if item.solid.any()]
     if not chosen or len(point_map) == 0:
         return None
     queries = _Queries(*(np.concatenate(column) for column in zip(*chosen, strict=True)))
@@ -85,10 +81,10 @@ def associate(
     )
 
 
-def _choose(item: WindowScan, count: int) -> tuple[IntArray, IntArray, FloatArray, FloatArray, Float32Array, Float32Array, FloatArray]:
-    """Return the rows of ``_Queries`` of one scan: points spread evenly along the stripe."""
-    scan = item.scan
-    which = np.unique(np.linspace(0, len(scan) - 1, min(count, len(scan))).round().astype(np.int64))
+def _choose(item: PosedScan, count: int) -> tuple[AnyArray, ...]:
+    """Return the rows of ``_Queries`` of one scan: solid points, spread evenly along the stripe."""
+    scan, solid = item.scan, np.flatnonzero(item.solid)
+    which = solid[:: max(len(solid) // count, 1)]
     points = scan.points[which]
     return (
         np.full(len(which), scan.stamp_ns),
@@ -96,7 +92,7 @@ def _choose(item: WindowScan, count: int) -> tuple[IntArray, IntArray, FloatArra
         points,
         transform(item.T_map_camera, points),
         item.colours[which],
-        item.normals[which],
+        item.map_normals[which],
         scan.sigma[which],
     )
 
@@ -106,27 +102,34 @@ def _search(point_map: PointMap, queries: _Queries, config: AssociationConfig) -
     c, limits = point_map.columns, point_map.config
     planes, outcome = np.empty((len(queries.stamps), 8)), np.empty(len(queries.stamps), np.int64)
     _search_planes(
-        point_map.grid.heads, point_map.grid.next, point_map.grid.cell_m, c.position, c.normal, c.colour, c.scan, c.entered_ns, c.sigma,
-        queries.points_map, queries.colours, queries.normals, queries.numbers - config.min_age_scans,
-        queries.stamps - int(config.min_age_s * NANOSECONDS), config.gate, config.max_colour, np.cos(np.radians(config.max_angle_deg)),
-        limits.normal_radius, limits.min_planarity, config.min_neighbours, planes, outcome,
-    )  # fmt: skip
+        (point_map.grid.heads, point_map.grid.next, point_map.grid.cell_m),
+        (c.position, c.normal, c.colour, c.scan, c.entered_ns, c.sigma, c.solid),
+        (queries.points_map, queries.colours, queries.normals),
+        queries.numbers - config.min_age_scans,
+        queries.stamps - int(config.min_age_s * NANOSECONDS),
+        (config.gate, config.max_colour, np.cos(np.radians(config.max_angle_deg)), limits.normal_radius, limits.min_planarity),
+        config.min_neighbours,
+        planes,
+        outcome,
+    )
     return planes, outcome
 
 
 @njit(cache=True)
 def _search_planes(  # type: ignore[no-untyped-def]
-    heads, following, cell_m, position, normal, colour, scan, entered_ns, sigma,
-    points, colours, normals, newest_scan, newest_ns, gate, max_colour, min_cosine,
-    radius, min_planarity, min_neighbours, planes, outcome,
-):  # fmt: skip
-    """For each point write the plane (centroid, normal, sigma, weight) it corresponds to, and what came of it (index of ``_REASONS``)."""
+    grid, columns, queries, newest_scan, newest_ns, limits, min_neighbours, planes, outcome
+):
+    """For each query write the plane (centroid, normal, sigma, weight) it corresponds to, and the index into ``_REASONS``."""
+    heads, following, cell_m = grid
+    position, normal, colour, scan, entered_ns, sigma, solid = columns
+    points, colours, normals = queries
+    gate, max_colour, min_cosine, radius, min_planarity = limits
     found = np.empty(MAX_NEIGHBOURS, np.int64)
     fit = np.empty(8)
     for index in range(len(points)):
         p = points[index]
         nearest, seen = _nearest_old(
-            heads, following, cell_m, position, scan, entered_ns, p, newest_scan[index], newest_ns[index], gate
+            heads, following, cell_m, position, scan, entered_ns, solid, p, newest_scan[index], newest_ns[index], gate
         )
         if nearest < 0:
             outcome[index] = 2 if seen else 1
@@ -137,7 +140,7 @@ def _search_planes(  # type: ignore[no-untyped-def]
         count = neighbours(heads, following, position, position[nearest], radius, cell_m, found)
         old = 0
         for at in found[:count]:
-            if scan[at] <= newest_scan[index] and entered_ns[at] <= newest_ns[index]:
+            if solid[at] and scan[at] <= newest_scan[index] and entered_ns[at] <= newest_ns[index]:
                 found[old] = at
                 old += 1
         fit_plane(position, found[:old], position[nearest], fit)
@@ -167,7 +170,7 @@ def _turn(plane, normal):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _nearest_old(  # type: ignore[no-untyped-def]
-    heads, following, cell_m, position, scan, entered_ns, p, newest_scan, newest_ns, gate
+    heads, following, cell_m, position, scan, entered_ns, solid, p, newest_scan, newest_ns, gate
 ):
     """Return the nearest point within ``gate`` that is old enough (or −1), and whether any point was within it.
 
@@ -191,7 +194,7 @@ def _nearest_old(  # type: ignore[no-untyped-def]
                         distance = (q[0] - p[0]) ** 2 + (q[1] - p[1]) ** 2 + (q[2] - p[2]) ** 2
                         if distance <= nearest:
                             seen = True
-                            if scan[at] <= newest_scan and entered_ns[at] <= newest_ns:
+                            if solid[at] and scan[at] <= newest_scan and entered_ns[at] <= newest_ns:
                                 best = at
                                 nearest = distance
                         at = following[at]

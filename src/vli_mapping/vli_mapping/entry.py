@@ -1,4 +1,7 @@
-"""Which points of a stripe may enter the map: no flying points at occlusion edges, no ghosts that one scan alone has seen."""
+"""Which points of a stripe are to be trusted: not beside an occlusion edge, not grazing, seen by the scans beside it too.
+
+The others may fly, or be ghosts: they only fill what nothing better has covered, and leave when something does.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from numba import njit
 
 from vli_common.arrays import BoolArray, Float32Array, FloatArray
 from vli_mapping.config import EntryConfig
-from vli_mapping.spatial_hash import SpatialHash, neighbours
+from vli_mapping.spatial_hash import SpatialHash, any_near
 
 _NOISE_SIGMAS = 3.0
 
@@ -30,16 +33,25 @@ def supported(points: FloatArray, beside: FloatArray, radius: float) -> BoolArra
     """Return for which points (N, 3) a point of the scans beside (M, 3) lies within ``radius``."""
     result = np.zeros(len(points), np.bool_)
     if len(beside):
-        grid = SpatialHash.of(beside, 2 * radius)
+        grid = SpatialHash.of(beside, radius)
         _mark_supported(grid.heads, grid.next, beside, grid.cell_m, points, radius, result)
     return result
 
 
-def not_grazing(points: FloatArray, normals: Float32Array, viewpoint: FloatArray, max_incidence_deg: float) -> BoolArray:
-    """Return which points (N, 3) are seen at less than ``max_incidence_deg`` from their normal (N, 3), or have none."""
-    towards = viewpoint - points
-    cosine = np.einsum("ni,ni->n", towards, normals) / np.linalg.norm(towards, axis=1)
-    result: BoolArray = (cosine >= np.cos(np.radians(max_incidence_deg))) | ~normals.any(axis=1)
+def facing(points: FloatArray, normals: Float32Array, max_incidence_deg: float) -> BoolArray:
+    """Return which points (N, 3) have a normal (N, 3), and are seen at less than ``max_incidence_deg`` from it; camera frame."""
+    cosine = -np.einsum("ni,ni->n", points, normals) / np.linalg.norm(points, axis=1)
+    result: BoolArray = cosine >= np.cos(np.radians(max_incidence_deg))
+    return result
+
+
+def noisy(points: FloatArray, sigma: FloatArray, max_ratio: float) -> BoolArray:
+    """Return where the stripe is blurred beyond ``max_ratio`` of its median, as it is where it falls over an edge.
+
+    The sigma of a triangulated point grows with z²; what is left is that of the pixel.
+    """
+    blur = sigma / points[:, 2] ** 2
+    result: BoolArray = blur > max_ratio * np.median(blur)
     return result
 
 
@@ -73,6 +85,5 @@ def _jumps(a, b, sigma, edge_jump, slope):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _mark_supported(heads, following, beside, cell_m, points, radius, result):  # type: ignore[no-untyped-def]
-    found = np.empty(1, np.int64)
     for index in range(len(points)):
-        result[index] = neighbours(heads, following, beside, points[index], radius, cell_m, found) > 0
+        result[index] = any_near(heads, following, beside, points[index], radius, cell_m)

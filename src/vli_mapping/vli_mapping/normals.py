@@ -1,7 +1,8 @@
 """Normals from neighbouring points: a plane through those within a radius, by principal components.
 
-The planarity of a neighbourhood is 1 − λ₀/λ₁ of the eigenvalues λ₀ ≤ λ₁ ≤ λ₂ of its covariance: near 1 on a surface, small on an edge,
-in clutter, and along a single stripe, whose points say nothing of the direction across. Where it is low there is no normal, (0, 0, 0).
+The planarity of a neighbourhood is 1 − λ₀/λ₁ of the eigenvalues λ₀ ≤ λ₁ ≤ λ₂ of its covariance: near 1 on a surface, small on
+an edge, in clutter, and along a single stripe, whose points say nothing of the direction across. Where it is low there is no
+normal, (0, 0, 0).
 """
 
 from __future__ import annotations
@@ -14,25 +15,28 @@ from vli_mapping.spatial_hash import SpatialHash, neighbours
 
 MAX_NEIGHBOURS = 192
 MIN_NEIGHBOURS = 6
+_SPARSE = 3
 
 
 def stripe_normals(
-    points: FloatArray, beside: FloatArray, viewpoint: FloatArray, radius: float, min_planarity: float
+    points: FloatArray, beside: FloatArray, radius: float, min_planarity: float
 ) -> tuple[Float32Array, Float32Array]:
-    """Return normals (N, 3), towards the viewpoint, and planarities (N,) of one stripe from itself and the scans beside it.
+    """Return normals (N, 3), towards the camera, and planarities (N,) of one stripe from itself and the scans beside it.
 
     Args:
-        points: (N, 3), the stripe, in map.
-        beside: (M, 3), the points of its neighbouring scans, in map.
-        viewpoint: (3,), the camera centre in map.
+        points: (N, 3), the stripe, in its camera frame.
+        beside: (M, 3), the points of its neighbouring scans, in the same frame.
         radius: of the neighbourhood, metres.
         min_planarity: below it, and where only one scan is near, the normal is (0, 0, 0).
     """
-    everything = np.concatenate([points, beside])
-    grid = SpatialHash.of(everything, radius)
+    # Every third point says as much of the plane: pixels along a stripe are much closer than stripes are.
+    sparse = np.concatenate([points[::_SPARSE], beside[::_SPARSE]])
+    grid = SpatialHash.of(sparse, radius)
     normals, planarity = np.zeros((len(points), 3), np.float32), np.zeros(len(points), np.float32)
     which = np.arange(len(points))
-    _fit_normals(grid.heads, grid.next, everything, grid.cell_m, which, viewpoint, radius, min_planarity, normals, planarity)
+    _fit_normals(
+        grid.heads, grid.next, sparse, grid.cell_m, points, which, np.zeros(3), radius, min_planarity, normals, planarity
+    )
     return normals, planarity
 
 
@@ -47,17 +51,19 @@ def refine_normals(
     planarity: Float32Array,
 ) -> None:
     """Fit again, in place, the normals of points ``which`` (K,) of a map: (N, 3) positions and normals, (N,) planarity."""
-    _fit_normals(grid.heads, grid.next, positions, grid.cell_m, which, viewpoint, radius, min_planarity, normals, planarity)
+    _fit_normals(
+        grid.heads, grid.next, positions, grid.cell_m, positions, which, viewpoint, radius, min_planarity, normals, planarity
+    )
 
 
 @njit(cache=True)
 def _fit_normals(  # type: ignore[no-untyped-def]
-    heads, following, positions, cell_m, which, viewpoint, radius, min_planarity, normals, planarity
+    heads, following, positions, cell_m, points, which, viewpoint, radius, min_planarity, normals, planarity
 ):
     found = np.empty(MAX_NEIGHBOURS, np.int64)
     plane = np.empty(8)
     for index in which:
-        centre = positions[index]
+        centre = points[index]
         count = neighbours(heads, following, positions, centre, radius, cell_m, found)
         fit_plane(positions, found[:count], centre, plane)
         planarity[index] = plane[6]
@@ -77,7 +83,8 @@ def _fit_normals(  # type: ignore[no-untyped-def]
 def fit_plane(positions, which, origin, plane):  # type: ignore[no-untyped-def]
     """Fit a plane to points ``which`` (K,) of ``positions``; sums are taken about ``origin`` (3,).
 
-    Writes into ``plane`` (8,): centroid, unit normal, planarity in [0, 1], RMS distance to the plane. Fewer than 3 points: planarity 0.
+    Writes into ``plane`` (8,): centroid, unit normal, planarity in [0, 1], RMS distance to the plane. Planarity is 0 where there
+    are fewer than 3 points.
     """
     count = len(which)
     plane[3:] = 0.0
@@ -108,7 +115,7 @@ def fit_plane(positions, which, origin, plane):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def smallest_eigenpair(xx, xy, xz, yy, yz, zz, vector):  # type: ignore[no-untyped-def]
-    """Write the eigenvector of the smallest eigenvalue of a symmetric positive (semi-)definite 3×3; return the two smallest values.
+    """Write the eigenvector of the smallest eigenvalue of a symmetric positive semi-definite 3×3; return the two smallest values.
 
     The closed form of Smith (1961). ``vector`` is zero where the two smallest eigenvalues coincide.
     """

@@ -1,9 +1,9 @@
 """A picture of a cloud without a display: point splats with a depth buffer, eye-dome lighting, three views on one sheet.
 
-Each point is a disc wider than the points are apart; the discs that lie in front at a pixel are blended, so that surfaces close and are
-smooth, and edges stay sharp (after Botsch et al., "High-quality surface splatting on today's GPUs", 2005). Shading is by the change of
-depth around a pixel (eye-dome lighting: Boucheny, "Visualisation scientifique de grands volumes de données", 2009) and gently by the
-normal; colours are those of the map.
+Each point is a disc wider than the points are apart; the discs that lie in front at a pixel are blended, so that surfaces close
+and are smooth, and edges stay sharp (after Botsch et al., "High-quality surface splatting on today's GPUs", 2005). Shading is by
+the change of depth around a pixel (eye-dome lighting: Boucheny, "Visualisation scientifique de grands volumes de données", 2009)
+and gently by the normal; colours are those of the map.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numba import njit
 
-from vli_common.arrays import BoolArray, ByteArray, Float32Array, FloatArray, Int32Array
+from vli_common.arrays import BoolArray, ByteArray, Float32Array, FloatArray
 from vli_common.errors import OutputError
 from vli_common.types import PointCloud
 
@@ -38,7 +38,7 @@ _TARGET_BRIGHTNESS = 0.85
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """An orthographic view: rows of ``axes`` (3, 3) are right, up and towards the viewer, in map; ``centre`` (3,) is in the middle."""
+    """An orthographic view: rows of ``axes`` (3, 3) are right, up and towards the viewer; ``centre`` (3,) is in the middle."""
 
     title: str
     axes: FloatArray
@@ -103,7 +103,7 @@ def draw(
     _front(local, splat, depth)
     _blend(local, splat, max(2 * spacing / pixel, 2.0), depth, lit, blend)
     seen = blend[..., 4] > 0
-    mean = blend[..., :4] / np.where(seen, blend[..., 4], 1.0)[..., None]
+    mean = (blend[..., :4] / np.where(seen, blend[..., 4], 1.0)[..., None]).astype(np.float32)
     canvas = mean[..., :3] * _eye_dome(mean[..., 3], seen, splat)[..., None]
     big = cv2.resize(background, (width, height), interpolation=cv2.INTER_LINEAR).astype(np.float32) / 255
     canvas = np.where(seen[..., None], canvas, big)
@@ -119,7 +119,7 @@ def point_spacing(points: FloatArray) -> float:
     if len(points) < 6:
         return 1e-3
     sample = points[np.linspace(0, len(points) - 1, min(len(points), 4000)).astype(np.int64)]
-    distance, _ = KDTree(points).query(sample, k=5)
+    distance: FloatArray = np.asarray(KDTree(points).query(sample, k=5)[0])
     return max(float(np.percentile(distance[:, 4], 75)), 1e-6)
 
 
@@ -191,7 +191,7 @@ def _busiest(points: FloatArray, frame: FloatArray) -> FloatArray:
     low, high = np.percentile(local[:, :2], [15, 85], axis=0)
     inside = ((local[:, :2] >= low) & (local[:, :2] <= high)).all(axis=1)
     if not inside.any():
-        return points.mean(axis=0)
+        inside[:] = True
     cells = np.floor((local[:, :2] - low) / np.maximum((high - low) / 4, 1e-9)).astype(np.int64).clip(0, 3)
     number = cells[:, 0] * 4 + cells[:, 1]
     relief = [float(local[inside & (number == k), 2].std()) if (inside & (number == k)).sum() > 50 else 0.0 for k in range(16)]
@@ -270,7 +270,7 @@ def _text(image: ByteArray, text: str, at: tuple[int, int], size: float, colour:
 
 @njit(cache=True)
 def _front(local, radius, depth):  # type: ignore[no-untyped-def]
-    """Write the nearest depth at each pixel of discs at local (N, 3): x right, y up from the middle, z towards the viewer, in pixels."""
+    """Write the nearest depth at each pixel of discs at local (N, 3): x right, y up, z towards the viewer; pixels, from the middle."""
     height, width = depth.shape
     reach = int(np.ceil(radius))
     for number in range(len(local)):

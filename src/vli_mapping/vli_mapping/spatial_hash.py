@@ -1,8 +1,9 @@
 """Points by place: a chained hash of cubic cells whose cost does not depend on how many points there are.
 
-A bucket holds the first of a chain of points, ``next`` the one after each. The low bits of a bucket are the cell's place in a block of
-4×4×4 cells, so that a stripe touches few cache lines however large the table is (after Nießner et al., "Real-time 3D reconstruction at
-scale using voxel hashing", 2013). Cells that fall into one bucket share its chain: who visits a cell skips the points of the others.
+A bucket holds the first of a chain of points, ``next`` the one after each. The low bits of a bucket are the cell's place in a
+block of 4×4×4 cells, so that a stripe touches few cache lines however large the table is (after Nießner et al., "Real-time 3D
+reconstruction at scale using voxel hashing", 2013). Cells that fall into one bucket share its chain: who visits a cell skips the
+points of the others.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from vli_common.arrays import FloatArray, Int32Array
+from vli_common.arrays import BoolArray, FloatArray, Int32Array
 
 NONE = -1
 """End of a chain; an empty bucket."""
@@ -30,14 +31,20 @@ class SpatialHash:
         self.heads: Int32Array = np.full(_buckets_for(capacity), NONE, np.int32)
         self.next: Int32Array = np.empty(capacity, np.int32)
 
-    def reserve(self, capacity: int, positions: FloatArray, count: int) -> None:
-        """Make room for ``capacity`` points, of which the first ``count`` of ``positions`` (N, 3) are linked already."""
+    def reserve(self, capacity: int, positions: FloatArray, linked: BoolArray) -> None:
+        """Make room for ``capacity`` points.
+
+        Args:
+            capacity: new number of rows.
+            positions: (≥ N, 3), of the N rows in use now.
+            linked: (N,), which of these are in a chain.
+        """
         grown = np.empty(capacity, np.int32)
-        grown[:count] = self.next[:count]
+        grown[: len(linked)] = self.next[: len(linked)]
         self.next = grown
         if _buckets_for(capacity) > len(self.heads):
             self.heads = np.full(_buckets_for(capacity), NONE, np.int32)
-            link(self.heads, self.next, positions, 0, count, self.cell_m)
+            _link_again(self.heads, self.next, positions, linked, self.cell_m)
 
     @staticmethod
     def of(positions: FloatArray, cell_m: float) -> SpatialHash:
@@ -97,6 +104,13 @@ def link(heads, following, positions, start, stop, cell_m):  # type: ignore[no-u
 
 
 @njit(cache=True)
+def _link_again(heads, following, positions, linked, cell_m):  # type: ignore[no-untyped-def]
+    for index in range(len(linked)):
+        if linked[index]:
+            link_one(heads, following, index, positions[index], cell_m)
+
+
+@njit(cache=True)
 def same_cell(position, i, j, k, cell_m):  # type: ignore[no-untyped-def]
     """Return True where ``position`` lies in cell (i, j, k)."""
     return cell_of(position[0], cell_m) == i and cell_of(position[1], cell_m) == j and cell_of(position[2], cell_m) == k
@@ -119,3 +133,19 @@ def neighbours(heads, following, positions, centre, radius, cell_m, found):  # t
                         count += 1
                     at = following[at]
     return count
+
+
+@njit(cache=True)
+def any_near(heads, following, positions, centre, radius, cell_m):  # type: ignore[no-untyped-def]
+    """Return True where a point lies within ``radius`` of ``centre``."""
+    squared = radius * radius
+    for i in range(cell_of(centre[0] - radius, cell_m), cell_of(centre[0] + radius, cell_m) + 1):
+        for j in range(cell_of(centre[1] - radius, cell_m), cell_of(centre[1] + radius, cell_m) + 1):
+            for k in range(cell_of(centre[2] - radius, cell_m), cell_of(centre[2] + radius, cell_m) + 1):
+                at = heads[bucket_of(i, j, k, len(heads))]
+                while at != NONE:
+                    p = positions[at]
+                    if (p[0] - centre[0]) ** 2 + (p[1] - centre[1]) ** 2 + (p[2] - centre[2]) ** 2 <= squared:
+                        return True
+                    at = following[at]
+    return False

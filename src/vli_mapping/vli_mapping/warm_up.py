@@ -2,6 +2,38 @@
 
 from __future__ import annotations
 
+import numpy as np
+
+from vli_common.camera import make_camera
+from vli_common.types import Counters, LaserScan
+from vli_mapping.association import associate
+from vli_mapping.colour import colour_points
+from vli_mapping.config import AssociationConfig, EntryConfig, MapConfig
+from vli_mapping.entry import away_from_edges, facing, noisy, supported
+from vli_mapping.normals import stripe_normals
+from vli_mapping.point_map import PointMap, Stripe
+from vli_mapping.scan_window import PosedScan
+from vli_mapping.thinning import thin
+
 
 def warm_up() -> None:
     """Run each compiled kernel once, with the types it meets at work; fast where the compiled code is in numba's cache."""
+    limits, entry = MapConfig(), EntryConfig()
+    point_map = PointMap(limits, capacity=16)
+    points = np.stack([np.linspace(-0.01, 0.01, 64), np.zeros(64), np.full(64, 0.03)], axis=1)
+    step, sigma = np.array([0.0, 3e-4, 0.0]), np.full(64, 3e-5)
+    for number in range(6):
+        row = points + number * step
+        normals, planarity = stripe_normals(row, row + step, limits.normal_radius, limits.min_planarity)
+        solid = away_from_edges(row, sigma, entry) & supported(row, row, entry.support_radius) & facing(row, normals, 80.0)
+        solid[::3] = ~noisy(row, sigma, entry.max_blur)[::3] & (number % 2 == 0)
+        stripe = Stripe(0, number, np.zeros(3), row, normals, planarity, np.zeros((64, 3), np.float32), sigma, solid)
+        point_map.refine_normals(np.unique(point_map.insert(stripe).clip(0)), np.zeros(3))
+    scan = LaserScan(0, points, points[:, :2], sigma, sigma)
+    every, normals, planarity = np.ones(64, np.bool_), np.zeros((64, 3), np.float32), np.zeros(64, np.float32)
+    posed = PosedScan(scan, 1000, np.eye(4), np.zeros((64, 3), np.float32), every, every, normals, planarity)
+    associate(point_map, [posed], 0, AssociationConfig(min_age_s=0.0), Counters())
+    thin(point_map.columns.position[: point_map.rows], point_map.columns.weight[: point_map.rows], 8)
+    camera = make_camera("none", (100.0, 100.0, 8.0, 8.0), (), (16, 16))
+    for shape in ((16, 16, 3), (16, 16)):
+        colour_points(camera, points, [(np.zeros(shape, np.uint8), np.eye(4))])

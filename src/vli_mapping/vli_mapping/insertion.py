@@ -1,0 +1,198 @@
+"""How a stripe enters the map: kernels over the map's columns and its hash."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from vli_mapping.spatial_hash import bucket_of, cell_of, link_one, unlink_one
+
+ROWS, FREE_HEAD, FREE = 0, 1, 2
+"""Of the state (3,): rows in use, first of the chain of free rows among them (−1: none), and how many these are."""
+
+
+@njit(cache=True)
+def insert_stripe(heads, following, cell_m, state, columns, stripe, number, stamp_ns, limits, target):  # type: ignore[no-untyped-def]
+    """Merge or add every point of a stripe, solid ones first; write its row, or −1, into ``target`` (N,).
+
+    Args:
+        heads, following, cell_m: the hash of the map.
+        state: (3,), see ``ROWS``.
+        columns: of ``Columns``, in its order.
+        stripe: points, normals, colours, sigma, planarity, solid of ``Stripe``.
+        number, stamp_ns: of the scan.
+        limits: merge radius, cosine of the merge angle, merge colour, cap on the weight, fill radius.
+        target: the answer.
+    """
+    position, solid = columns[0], columns[8]
+    points, stripe_solid = stripe[0], stripe[5]
+    merge_radius, fill_radius = limits[0], limits[4]
+    for wanted in (True, False):
+        for index in range(len(points)):
+            if stripe_solid[index] != wanted:
+                continue
+            p = points[index]
+            target[index] = -1
+            if not wanted and _covered(heads, following, cell_m, position, solid, p, fill_radius):
+                continue
+            at = _nearest_compatible(heads, following, cell_m, columns, p, stripe, index, merge_radius, limits)
+            if at >= 0:
+                _merge(heads, following, cell_m, at, columns, stripe, index, limits[3])
+            else:
+                if wanted:
+                    _drop_doubtful(heads, following, cell_m, state, columns, p, fill_radius)
+                at = _add(heads, following, cell_m, state, columns, stripe, index, number, stamp_ns)
+            target[index] = at
+
+
+@njit(cache=True)
+def _add(heads, following, cell_m, state, columns, stripe, index, number, stamp_ns):  # type: ignore[no-untyped-def]
+    """Write a point into a row that is free, else into a new one; return the row."""
+    position, normal, colour, weight, sigma, planarity, scan, entered_ns, solid = columns
+    points, normals, colours, sigmas, planarities, stripe_solid = stripe
+    at = state[FREE_HEAD]
+    if at >= 0:
+        state[FREE_HEAD] = following[at]
+        state[FREE] -= 1
+    else:
+        at = state[ROWS]
+        state[ROWS] += 1
+    position[at] = points[index]
+    normal[at] = normals[index]
+    colour[at] = colours[index]
+    weight[at] = 1.0
+    sigma[at] = sigmas[index]
+    planarity[at] = planarities[index]
+    scan[at] = number
+    entered_ns[at] = stamp_ns
+    solid[at] = stripe_solid[index]
+    link_one(heads, following, at, position[at], cell_m)
+    return at
+
+
+@njit(cache=True)
+def _covered(heads, following, cell_m, position, solid, p, radius):  # type: ignore[no-untyped-def]
+    """Return True where a solid point lies within ``radius`` of ``p``."""
+    for i in range(cell_of(p[0] - radius, cell_m), cell_of(p[0] + radius, cell_m) + 1):
+        for j in range(cell_of(p[1] - radius, cell_m), cell_of(p[1] + radius, cell_m) + 1):
+            for k in range(cell_of(p[2] - radius, cell_m), cell_of(p[2] + radius, cell_m) + 1):
+                at = heads[bucket_of(i, j, k, len(heads))]
+                while at >= 0:
+                    if solid[at] and squared_distance(position[at], p) <= radius * radius:
+                        return True
+                    at = following[at]
+    return False
+
+
+@njit(cache=True)
+def _drop_doubtful(heads, following, cell_m, state, columns, p, radius):  # type: ignore[no-untyped-def]
+    """Let the doubtful points within ``radius`` of ``p`` leave: their rows are free."""
+    position, weight, solid = columns[0], columns[3], columns[8]
+    for i in range(cell_of(p[0] - radius, cell_m), cell_of(p[0] + radius, cell_m) + 1):
+        for j in range(cell_of(p[1] - radius, cell_m), cell_of(p[1] + radius, cell_m) + 1):
+            for k in range(cell_of(p[2] - radius, cell_m), cell_of(p[2] + radius, cell_m) + 1):
+                at = heads[bucket_of(i, j, k, len(heads))]
+                while at >= 0:
+                    after = following[at]
+                    if not solid[at] and squared_distance(position[at], p) <= radius * radius:
+                        unlink_one(heads, following, at, position[at], cell_m)
+                        weight[at] = 0.0
+                        following[at] = state[FREE_HEAD]
+                        state[FREE_HEAD] = at
+                        state[FREE] += 1
+                    at = after
+
+
+@njit(cache=True)
+def squared_distance(a, b):  # type: ignore[no-untyped-def]
+    """Return |a − b|² of two points (3,)."""
+    return (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2
+
+
+@njit(cache=True)
+def _nearest_compatible(heads, following, cell_m, columns, p, stripe, index, radius, limits):  # type: ignore[no-untyped-def]
+    """Return the row of the nearest point, as solid as the stripe's, that agrees in normal and colour; −1 where there is none."""
+    position, normal, colour, solid = columns[0], columns[1], columns[2], columns[8]
+    n, c, wanted = stripe[1][index], stripe[2][index], stripe[5][index]
+    best = np.int64(-1)
+    nearest = radius * radius
+    for i in range(cell_of(p[0] - radius, cell_m), cell_of(p[0] + radius, cell_m) + 1):
+        for j in range(cell_of(p[1] - radius, cell_m), cell_of(p[1] + radius, cell_m) + 1):
+            for k in range(cell_of(p[2] - radius, cell_m), cell_of(p[2] + radius, cell_m) + 1):
+                at = np.int64(heads[bucket_of(i, j, k, len(heads))])
+                while at >= 0:
+                    distance = squared_distance(position[at], p)
+                    if (
+                        distance < nearest
+                        and solid[at] == wanted
+                        and normals_agree(normal[at], n, limits[1])
+                        and colours_agree(colour[at], c, limits[2])
+                    ):
+                        best = at
+                        nearest = distance
+                    at = np.int64(following[at])
+    return best
+
+
+@njit(cache=True)
+def normals_agree(a, b, min_cosine):  # type: ignore[no-untyped-def]
+    """Return True where two normals (3,) are within the angle, or one is unknown (0)."""
+    if (a[0] == 0 and a[1] == 0 and a[2] == 0) or (b[0] == 0 and b[1] == 0 and b[2] == 0):
+        return True
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2] >= min_cosine
+
+
+@njit(cache=True)
+def colours_agree(a, b, limit):  # type: ignore[no-untyped-def]
+    """Return True where two colours (3,) differ by at most ``limit`` in every channel, or one is unknown (NaN)."""
+    # Written so that NaN passes.
+    return not (abs(a[0] - b[0]) > limit or abs(a[1] - b[1]) > limit or abs(a[2] - b[2]) > limit)
+
+
+@njit(cache=True)
+def _merge(heads, following, cell_m, at, columns, stripe, index, max_weight):  # type: ignore[no-untyped-def]
+    """Average point ``index`` of a stripe into row ``at``."""
+    position, normal, colour, weight, sigma = columns[:5]
+    p, n, c, sigma_new = stripe[0][index], stripe[1][index], stripe[2][index], stripe[3][index]
+    old_information, new_information = 1.0 / np.float64(sigma[at]) ** 2, 1.0 / np.float64(sigma_new) ** 2
+    gain = new_information / (old_information + new_information)
+    moved = np.empty(3)
+    same = True
+    for axis in range(3):
+        moved[axis] = position[at, axis] + gain * (p[axis] - position[at, axis])
+        same = same and cell_of(moved[axis], cell_m) == cell_of(position[at, axis], cell_m)
+    if not same:
+        unlink_one(heads, following, at, position[at], cell_m)
+    position[at] = moved
+    if not same:
+        link_one(heads, following, at, moved, cell_m)
+    share = 1.0 / (weight[at] + 1.0)
+    _blend_normal(normal[at], n, share)
+    for channel in range(3):
+        if np.isnan(colour[at, channel]):
+            colour[at, channel] = c[channel]
+        elif not np.isnan(c[channel]):
+            colour[at, channel] += share * (c[channel] - colour[at, channel])
+    information = old_information + new_information
+    merged = weight[at] + 1.0
+    if merged > max_weight:
+        information *= max_weight / merged
+        merged = max_weight
+    weight[at] = merged
+    sigma[at] = 1.0 / np.sqrt(information)
+
+
+@njit(cache=True)
+def _blend_normal(normal, n, share):  # type: ignore[no-untyped-def]
+    """Turn a normal (3,), in place, towards ``n`` by ``share``; an unknown one takes the other."""
+    if n[0] == 0 and n[1] == 0 and n[2] == 0:
+        return
+    if normal[0] == 0 and normal[1] == 0 and normal[2] == 0:
+        normal[:] = n
+        return
+    norm = 0.0
+    for axis in range(3):
+        normal[axis] += share * (n[axis] - normal[axis])
+        norm += normal[axis] ** 2
+    if norm > 0:
+        normal /= np.sqrt(norm)
