@@ -50,7 +50,7 @@ format: venv
 	$(BIN)/ruff format .
 
 bench: venv
-	$(BIN)/python -m pytest -m perf test/perf
+	$(BIN)/python -m pytest -m perf -q test/perf
 
 config: venv
 	$(BIN)/python -m vli_bringup.settings > config/vli.yaml

@@ -20,6 +20,8 @@ setup(
         "vli_common==0.1.0",
         "numba>=0.59",
         "numpy>=1.26",
+        "opencv-python-headless>=4.6,<5",
+        "scipy>=1.11",
     ],
     zip_safe=False,
     entry_points={

@@ -176,3 +176,9 @@ def test_half_a_bag_is_run_with_a_warning_of_what_was_lost(good_bag, calibration
     lines = capsys.readouterr().err.splitlines()
     assert sum("warning" in line and "half.mcap" in line for line in lines) == 1
     assert (tmp_path / "out" / "summary.json").exists()
+
+
+def test_images_that_are_none_are_left_out_and_counted(calibration, tmp_path, capsys):
+    bag = TinyBag(broken_images=0.1).write(tmp_path / "bag")
+    assert main(["run", str(bag), "--calib", str(calibration), "--out", str(tmp_path / "out")]) in (0, 1)
+    assert "warning: 12 undecodable images were left out" in capsys.readouterr().err

@@ -65,6 +65,8 @@ class TinyBag:
         gyro_unit: factor on the angular rate.
         size: width, height.
         seconds: length.
+        broken_images: share of the images, evenly spread, that are no images.
+        others: topic → text of one String message.
     """
 
     image_topics: tuple[str, ...] = ("/camera/image_raw/compressed",)
@@ -76,6 +78,7 @@ class TinyBag:
     gyro_unit: float = 1.0
     size: tuple[int, int] = (160, 120)
     seconds: float = 2.0
+    broken_images: float = 0.0
     others: dict[str, str] = field(default_factory=dict)
 
     def write(self, path: Path) -> Path:
@@ -97,10 +100,12 @@ class TinyBag:
         texture = cv2.GaussianBlur(rng.integers(0, 255, (height, width), dtype=np.uint8), (0, 0), 2)
         jpegs = [np.asarray(cv2.imencode(".jpg", (texture * gain).astype(np.uint8))[1]).ravel() for gain in (0.9, 0.05)]
         stamps = START_NS + np.arange(round(60 * self.seconds)) * NS // 60
+        every = round(1 / self.broken_images) if self.broken_images else len(stamps) + 1
+        data = [jpegs[index % 2] if (index + 1) % every else np.zeros(9, np.uint8) for index in range(len(stamps))]
         return [
-            (topic, int(stamp), kind(header(self.image_stamp(int(stamp))), "jpeg", jpegs[index % 2]))
+            (topic, int(stamp), kind(header(self.image_stamp(int(stamp))), "jpeg", bytes_))
             for topic in self.image_topics
-            for index, stamp in enumerate(stamps)
+            for stamp, bytes_ in zip(stamps, data, strict=True)
         ]
 
     def _imu(self) -> list[tuple[str, int, Any]]:

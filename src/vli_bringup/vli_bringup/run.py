@@ -79,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
         recorder = Recorder(calibration)
         clock = process(reader, pipeline, recorder, _duration_s(reader, args.start, args.duration), args.started_s)
         write(directory, pipeline, recorder, clock, settings)
-    for warning in [*warnings, *reader.warnings]:
+    for warning in [*warnings, *reader.warnings, *_losses(pipeline)]:
         _note(f"warning: {warning}")
     return report(pipeline, recorder, results.path)
 
@@ -154,6 +154,12 @@ def _duration_s(reader: BagReader, start_s: float, duration_s: float | None) -> 
     start_ns, end_ns = reader.time_range_ns
     left_s = max(0.0, (end_ns - start_ns) / NANOSECONDS - start_s)
     return left_s if duration_s is None else min(left_s, duration_s)
+
+
+def _losses(pipeline: Pipeline) -> list[str]:
+    """Return a line for each kind of image that the pipeline had to leave out."""
+    counts = {name: pipeline.counters[name] for name in ("undecodable_images", "images_of_another_shape")}
+    return [f"{count} {name.replace('_', ' ')} were left out" for name, count in counts.items() if count]
 
 
 def _note(text: str) -> None:
