@@ -284,3 +284,13 @@ def test_whatever_stands_in_the_file_there_is_a_calibration_or_a_calibration_err
         except CalibrationError:
             continue
         assert np.isfinite(calibration.camera.unproject(np.array([[0.0, 0.0], [639.0, 479.0]]))).all()
+
+
+def test_the_example_in_config_is_the_scanner_of_the_demo_bag(repository: Path) -> None:
+    example = load_calibration(repository / "config" / "calibration" / "example.yaml")
+    demo = load_calibration(repository / "bags" / "demo" / "calibration.yaml")
+    assert example.camera == demo.camera
+    assert example.imu == demo.imu
+    np.testing.assert_array_equal(example.T_cam_imu, demo.T_cam_imu)
+    assert example.laser is not None and demo.laser is not None
+    np.testing.assert_array_equal([*example.laser.normal, example.laser.d], [*demo.laser.normal, demo.laser.d])
