@@ -34,6 +34,8 @@ KEYFRAME_EVERY = 8
 WINDOW = 8
 """Keyframes."""
 REST_S = 1.5
+_SHEET, _POINTS = 1000, 600
+"""Points of a row of the synthetic sheet, and of a stripe that falls on a part of one."""
 
 
 def true_windows(trajectory: Trajectory, noise_m: float, seed: int = 0) -> Iterator[WindowPoses]:
@@ -130,21 +132,22 @@ def print_accuracy(mapper: Mapper, data: Path) -> None:
 def print_scaling(sizes: list[float]) -> None:
     """Print the time of a stripe's entry at several sizes of a synthetic map: a wavy sheet with points 0.25 mm apart."""
     for millions in sizes:
-        side = int(np.sqrt(millions * 1e6))
+        rows = int(millions * 1e6) // _SHEET
         point_map = PointMap()
         rng = np.random.default_rng(1)
-        for row in range(0, side):
-            point_map.insert(_stripe(row, side, 0, row, rng))
+        for row in range(rows):
+            point_map.insert(_stripe(row, _SHEET, 0, row, rng))
         spent = []
-        for number, row in enumerate(rng.integers(0, side, 200)):
-            at = int(rng.integers(0, max(side - 600, 1)))
-            stripe = _stripe(row, min(600, side), at, side + number, rng)
+        for number, row in enumerate(rng.integers(0, rows, 300)):
+            stripe = _stripe(row, _POINTS, int(rng.integers(0, _SHEET - _POINTS)), rows + number, rng)
             start = time.perf_counter()
             target = point_map.insert(stripe)
             point_map.refine_normals(np.unique(target), stripe.viewpoint)
             spent.append(time.perf_counter() - start)
-        print(f"{len(point_map) / 1e6:.2f} million points: {1e3 * np.median(spent):.3f} ms a stripe of {len(stripe)} (median), "
-              f"{1e3 * np.percentile(spent, 95):.3f} p95, {_memory_mb():.0f} MB resident")
+        print(
+            f"{len(point_map) / 1e6:.2f} million points: {1e3 * np.median(spent):.3f} ms a stripe of {len(stripe)} (median), "
+            f"{1e3 * np.percentile(spent, 95):.3f} p95, {_memory_mb():.0f} MB resident"
+        )
 
 
 def _stripe(row: int, count: int, start: int, number: int, rng: np.random.Generator) -> Stripe:
@@ -153,7 +156,7 @@ def _stripe(row: int, count: int, start: int, number: int, rng: np.random.Genera
     points = np.stack([x, y, 2e-3 * np.sin(40 * x) + 2e-3 * np.cos(30 * y)], axis=1) + rng.normal(size=(count, 3)) * 2e-5
     return Stripe(
         int(number * 33e6), number, points.mean(axis=0) + [0, 0, 0.03], points, np.zeros((count, 3), np.float32),
-        np.zeros(count, np.float32), np.full((count, 3), 100, np.float32), np.full(count, 5e-5),
+        np.zeros(count, np.float32), np.full((count, 3), 100, np.float32), np.full(count, 5e-5), np.ones(count, np.bool_),
     )
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from vli_common.arrays import AnyArray, Float32Array, FloatArray, IntArray
+from vli_common.arrays import Float32Array, FloatArray, IntArray
 from vli_common.geometry import transform
 from vli_common.types import NANOSECONDS, Counters, MapConstraints
 from vli_mapping.config import AssociationConfig
@@ -29,7 +29,7 @@ _REASONS = ("matched", "no_map_point", "too_young", "colour_differs", "no_plane"
 
 @dataclass(frozen=True, slots=True)
 class _Queries:
-    """The points that look for the map: in the camera, in map, and what must agree."""
+    """The points that look for the map, (N,) or (N, 3) each: in the camera, in map, and what must agree."""
 
     stamps: IntArray
     numbers: IntArray
@@ -58,10 +58,9 @@ def associate(
         counters: of what became of the points that looked for the map.
         session: of the window.
     """
-    chosen = [_choose(item, config.points_per_scan) for item in scans if item.solid.any()]
-    if not chosen or len(point_map) == 0:
+    if not scans or len(point_map) == 0:
         return None
-    queries = _Queries(*(np.concatenate(column) for column in zip(*chosen, strict=True)))
+    queries = _gather(scans, config.points_per_scan)
     planes, outcome = _search(point_map, queries, config)
     for code, reason in enumerate(_REASONS):
         counters.add(f"constraints_{reason}", int((outcome == code).sum()))
@@ -81,19 +80,21 @@ def associate(
     )
 
 
-def _choose(item: PosedScan, count: int) -> tuple[AnyArray, ...]:
-    """Return the rows of ``_Queries`` of one scan: solid points, spread evenly along the stripe."""
-    scan, solid = item.scan, np.flatnonzero(item.solid)
-    which = solid[:: max(len(solid) // count, 1)]
-    points = scan.points[which]
-    return (
-        np.full(len(which), scan.stamp_ns),
-        np.full(len(which), item.number),
-        points,
-        transform(item.T_map_camera, points),
-        item.colours[which],
-        item.map_normals[which],
-        scan.sigma[which],
+def _gather(scans: Sequence[PosedScan], count: int) -> _Queries:
+    """Return some ``count`` points of each scan, where they are believed to be now."""
+    probes = [item.probe(count) for item in scans]
+    sizes = [len(probe.points) for probe in probes]
+    T_map_camera = np.repeat(np.stack([item.T_map_camera for item in scans]), sizes, axis=0)
+    points = np.concatenate([probe.points for probe in probes])
+    normals = np.concatenate([probe.normals for probe in probes])
+    return _Queries(
+        stamps=np.repeat([item.scan.stamp_ns for item in scans], sizes),
+        numbers=np.repeat([item.number for item in scans], sizes),
+        points_camera=points,
+        points_map=transform(T_map_camera, points),
+        colours=np.concatenate([probe.colours for probe in probes]),
+        normals=np.einsum("nij,nj->ni", T_map_camera[:, :3, :3], normals).astype(np.float32),
+        sigma=np.concatenate([probe.sigma for probe in probes]),
     )
 
 

@@ -14,7 +14,7 @@ from vli_mapping.normals import refine_normals
 from vli_mapping.spatial_hash import NONE, SpatialHash
 from vli_mapping.thinning import thin
 
-CELL_M = 5e-4
+CELL_M = 8e-4
 UNKNOWN_COLOUR = 128
 """What a point shows that no long image saw."""
 _GROWTH = 1.5

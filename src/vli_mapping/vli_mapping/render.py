@@ -270,7 +270,7 @@ def _text(image: ByteArray, text: str, at: tuple[int, int], size: float, colour:
 
 @njit(cache=True)
 def _front(local, radius, depth):  # type: ignore[no-untyped-def]
-    """Write the nearest depth at each pixel of discs at local (N, 3): x right, y up, z towards the viewer; pixels, from the middle."""
+    """Write the nearest depth at each pixel of discs at local (N, 3): in pixels from the middle, z to the viewer."""
     height, width = depth.shape
     reach = int(np.ceil(radius))
     for number in range(len(local)):

@@ -20,6 +20,16 @@ from vli_mapping.normals import stripe_normals
 Stamped = TypeVar("Stamped", Image, LaserScan)
 
 
+@dataclass(frozen=True, slots=True)
+class Probe:
+    """Some points (K, 3) of a scan in its camera frame, with normals (K, 3), colours (K, 3) and sigma (K,)."""
+
+    points: FloatArray
+    normals: Float32Array
+    colours: Float32Array
+    sigma: FloatArray
+
+
 @dataclass
 class PosedScan:
     """A scan with its pose of now.
@@ -48,6 +58,18 @@ class PosedScan:
     final: bool = False
     redundant: bool = False
     published: bool = False
+    _probe: Probe | None = None
+
+    def probe(self, count: int) -> Probe:
+        """Return at least ``count`` solid points, spread evenly along the stripe (or all, where there are fewer)."""
+        if self._probe is not None:
+            return self._probe
+        solid = np.flatnonzero(self.solid)
+        which = solid[:: max(len(solid) // count, 1)]
+        probe = Probe(self.scan.points[which], self.normals[which], self.colours[which], self.scan.sigma[which])
+        if self.described:
+            self._probe = probe
+        return probe
 
     @property
     def points(self) -> FloatArray:
