@@ -292,5 +292,6 @@ def test_the_example_in_config_is_the_scanner_of_the_demo_bag(repository: Path) 
     assert example.camera == demo.camera
     assert example.imu == demo.imu
     np.testing.assert_array_equal(example.T_cam_imu, demo.T_cam_imu)
-    assert example.laser is not None and demo.laser is not None
+    assert example.laser is not None
+    assert demo.laser is not None
     np.testing.assert_array_equal([*example.laser.normal, example.laser.d], [*demo.laser.normal, demo.laser.d])
