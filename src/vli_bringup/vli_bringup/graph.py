@@ -43,6 +43,15 @@ STAGES = (
 )
 """Package and executable of every node behind the source, in the order of the data."""
 
+NODE_ONLY = frozenset(
+    {
+        *("mode", "calibration_file", "imu_calibration_file"),
+        *("bag", "rate", "loop", "start", "duration", "wait_for", "wait_timeout"),
+        *("image_topic", "exposure_topic", "imu_topic", "save_path"),
+    }
+)
+"""Parameters of nodes that are no parameter of a stage; a parameter file may hold them, and only the nodes mind them."""
+
 
 def describe_graph(
     calibration: Path,

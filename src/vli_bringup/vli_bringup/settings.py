@@ -16,7 +16,8 @@ from typing import Any
 import yaml
 
 from vli_backend.config import BackEndConfig
-from vli_common.config import flatten, from_mapping, section, to_yaml_lines, unknown_key
+from vli_bringup.graph import NODE_ONLY
+from vli_common.config import flatten, from_mapping, parameters, section, to_yaml_lines, unknown_key
 from vli_common.errors import ConfigError
 from vli_driver.config import DemuxConfig, DriverConfig, StripeConfig
 from vli_frontend.config import FrontEndConfig
@@ -120,7 +121,9 @@ def _node_parameters(name: str, content: Any) -> dict[str, Any]:
         raise ConfigError([f"section '{name}', expected one key '{_PARAMETERS}:' with the parameters below it"])
     stages = NODES[node]
     prefix = f"{stages[0]}." if len(stages) == 1 else ""
-    return flatten(content[_PARAMETERS] or {}, prefix)
+    known = {spec.name for spec in parameters(Settings)}
+    flat = flatten(content[_PARAMETERS] or {}, prefix)
+    return {key: value for key, value in flat.items() if key in known or key.removeprefix(prefix) not in NODE_ONLY}
 
 
 def _load(text: str) -> Any:

@@ -5,9 +5,15 @@ from __future__ import annotations
 import pytest
 import yaml
 
+from vli_bringup.graph import NODE_ONLY
 from vli_bringup.settings import NODES, Settings, load_settings, to_yaml
 from vli_common.config import parameters
 from vli_common.errors import ConfigError
+from vli_common.node.parameters import NodeConfig
+from vli_driver.nodes import demux_node
+from vli_driver.player import PlaybackConfig
+from vli_frontend.nodes import frontend_node
+from vli_mapping.nodes import mapping_node
 
 
 def write(path, text):
@@ -76,3 +82,15 @@ def test_all_wrong_assignments_are_said_at_once():
     with pytest.raises(ConfigError) as error:
         load_settings(assignments=["backend.window_keyframes", "backend.tilt=1", "demux.min_ratio=much"])
     assert len(error.value.problems) == 3
+
+
+def test_what_concerns_nodes_only_may_stand_in_the_file_and_is_passed_over(tmp_path):
+    text = "/**/demux_node: {ros__parameters: {image_topic: /front, mode: vi, demux.min_ratio: 2.5}}\n"
+    text += "/**/driver_node: {ros__parameters: {image_topic: /front, rate: 0.5}}\n"
+    settings = load_settings(write(tmp_path / "vli.yaml", text))
+    assert (settings.demux.min_ratio, settings.driver.image_topic) == (2.5, "/front")
+
+
+def test_the_parameters_of_nodes_only_are_those_that_the_nodes_declare():
+    configs = (NodeConfig, PlaybackConfig, demux_node.InputTopics, frontend_node.InputTopics, mapping_node.StoreConfig)
+    assert {spec.name for config in configs for spec in parameters(config)} == NODE_ONLY
