@@ -35,7 +35,7 @@ class MapConfig:
         doc="doubtful points stay only where no solid one is this near; larger: fewer outliers, gaps",
     )
     min_planarity: float = parameter(
-        0.6, minimum=0.0, maximum=1.0, doc="flatness below which a point has no normal rather than a wrong one"
+        0.75, minimum=0.0, maximum=1.0, doc="flatness below which a point has no normal rather than a wrong one"
     )
 
 

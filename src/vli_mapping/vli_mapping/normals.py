@@ -1,8 +1,8 @@
 """Normals from neighbouring points: a plane through those within a radius, by principal components.
 
-The planarity of a neighbourhood is 1 − λ₀/λ₁ of the eigenvalues λ₀ ≤ λ₁ ≤ λ₂ of its covariance: near 1 on a surface, small on
-an edge, in clutter, and along a single stripe, whose points say nothing of the direction across. Where it is low there is no
-normal, (0, 0, 0).
+The planarity of a neighbourhood is (1 − λ₀/λ₁) · min(1, 50 λ₁/λ₂) of the eigenvalues λ₀ ≤ λ₁ ≤ λ₂ of its covariance: near 1 on a
+surface, small on an edge, in clutter (the first factor), and along a single stripe, whose points say nothing of the direction
+across (the second). Where it is low there is no normal, (0, 0, 0).
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ from vli_mapping.spatial_hash import SpatialHash, neighbours
 MAX_NEIGHBOURS = 192
 MIN_NEIGHBOURS = 6
 _SPARSE = 3
+_LINE = 0.02
+"""λ₁/λ₂ below which a neighbourhood is more of a line: stripes less than some 0.1 mm apart, at a radius of 0.8 mm."""
 
 
 def stripe_normals(
@@ -108,14 +110,17 @@ def fit_plane(positions, which, origin, plane):  # type: ignore[no-untyped-def]
         yz += y * z
         zz += z * z
     plane[:3] = origin + mean
-    smallest, middle = smallest_eigenpair(xx / count, xy / count, xz / count, yy / count, yz / count, zz / count, plane[3:6])
-    plane[6] = 1.0 - smallest / middle if middle > 0 else 0.0
+    smallest, middle, largest = smallest_eigenvector(
+        xx / count, xy / count, xz / count, yy / count, yz / count, zz / count, plane[3:6]
+    )
+    if middle > 0:
+        plane[6] = (1.0 - smallest / middle) * min(1.0, middle / (_LINE * largest))
     plane[7] = np.sqrt(smallest)
 
 
 @njit(cache=True)
-def smallest_eigenpair(xx, xy, xz, yy, yz, zz, vector):  # type: ignore[no-untyped-def]
-    """Write the eigenvector of the smallest eigenvalue of a symmetric positive semi-definite 3×3; return the two smallest values.
+def smallest_eigenvector(xx, xy, xz, yy, yz, zz, vector):  # type: ignore[no-untyped-def]
+    """Write the eigenvector of the smallest eigenvalue of a symmetric positive semi-definite 3×3; return all three, ascending.
 
     The closed form of Smith (1961). ``vector`` is zero where the two smallest eigenvalues coincide.
     """
@@ -124,7 +129,7 @@ def smallest_eigenpair(xx, xy, xz, yy, yz, zz, vector):  # type: ignore[no-untyp
     off = xy * xy + xz * xz + yz * yz
     spread = np.sqrt(((xx - mean) ** 2 + (yy - mean) ** 2 + (zz - mean) ** 2 + 2 * off) / 6)
     if spread <= 1e-12 * mean or mean <= 0:
-        return max(mean, 0.0), max(mean, 0.0)
+        return max(mean, 0.0), max(mean, 0.0), max(mean, 0.0)
     a, b, c, d, e, f = (xx - mean) / spread, xy / spread, xz / spread, (yy - mean) / spread, yz / spread, (zz - mean) / spread
     half = (a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d)) / 2
     angle = np.arccos(min(1.0, max(-1.0, half))) / 3
@@ -146,4 +151,4 @@ def smallest_eigenpair(xx, xy, xz, yy, yz, zz, vector):  # type: ignore[no-untyp
         vector /= np.sqrt(best)
     else:
         vector[:] = 0.0
-    return max(mean + spread * lowest, 0.0), max(mean - spread * (largest + lowest), 0.0)
+    return max(mean + spread * lowest, 0.0), max(mean - spread * (largest + lowest), 0.0), mean + spread * largest
