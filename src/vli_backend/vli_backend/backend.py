@@ -116,7 +116,7 @@ class BackEnd:
             since = self._degraded_since_ns = self._degraded_since_ns or stamp
             self.state = TrackingState.DEGRADED
             self.reason = f"{result.landmarks} features match the window, {self._config.min_landmarks} are needed"
-            if stamp - since > self._config.lost_after_s * 1e9 or not estimator.plausible:
+            if stamp - since > self._config.lost_after_s * 1e9:
                 return self._lose(stamp, self.reason)
         return BackEndOutput(stamp, self.state, self.reason, result.pose, result.window, result.bias)
 

@@ -69,6 +69,7 @@ class WindowEstimator:
         self._T_cam_imu = calibration.T_cam_imu if calibration.T_cam_imu is not None else np.eye(4)
         self._T_imu_cam = inverse(self._T_cam_imu)
         self._limits = _inverse_depth_limits(calibration)
+        self._largest_jump = _range_m(calibration)[0]
         self._smoother: Smoother = GtsamSmoother(config.window_keyframes)
         self._landmarks = LandmarkTable(config.window_keyframes + 1)
         self._window = Window()
@@ -77,7 +78,6 @@ class WindowEstimator:
         self._moving_keyframes = 0
         self._T_map_odom = np.eye(4)
         self.constraints: MapConstraints | None = None
-        self.plausible = True
 
         self._smoother.start(state, prior)
         self._state = state
@@ -164,7 +164,7 @@ class WindowEstimator:
 
     def _frame_pose(self, tracks: Tracks, predicted: Prediction) -> FramePose:
         _, rows, columns = np.intersect1d(self._points.ids, tracks.ids, assume_unique=True, return_indices=True)
-        return solve_frame_pose(
+        found = solve_frame_pose(
             predicted.T_map_camera,
             predicted.information,
             self._points.positions[rows],
@@ -173,6 +173,16 @@ class WindowEstimator:
             self._ray_sigma(tracks)[columns],
             self._config.cauchy,
         )
+        if self._jump(predicted.T_map_camera, found.T_map_camera) < self._largest_jump:
+            return found
+        # No hand moves that far between two frames: the features are wrong, or the prediction is. Neither makes a pose.
+        return FramePose(predicted.T_map_camera, predicted.information, 0, np.inf, found.iterations)
+
+    @staticmethod
+    def _jump(before: FloatArray, after: FloatArray) -> float:
+        """Return the distance between two poses, metres; infinite where one is not finite."""
+        distance = float(np.linalg.norm(after[:3, 3] - before[:3, 3]))
+        return distance if np.isfinite(distance) else np.inf
 
     def _ray_sigma(self, tracks: Tracks) -> FloatArray:
         result: FloatArray = np.hypot(tracks.sigma_px, self._config.pixel_sigma) / self._focal_px
@@ -233,25 +243,28 @@ class WindowEstimator:
     def _solve(self, iterations: int) -> None:
         """Find depths, then poses, velocities and biases of the window."""
         self._measure_depths()
-        self._smoother.solve(self._condenser(self._landmarks.usable, with_map=True), iterations)
-        self.constraints = None
+        self._smoother.solve(self._condenser(self._landmarks.usable, range(len(self._window.intervals))), iterations)
         self._state = self._smoother.states()[-1]
-        if not np.isfinite(self._state.T_map_imu).all():
-            raise SmootherError("the solution is not finite")
+        jump = self._jump(self._records[-1].T_map_camera, self._state.T_map_imu @ self._T_imu_cam)
+        if jump > self._largest_jump:
+            raise SmootherError(f"the newest keyframe jumped by {jump:.3f} m")
         poses = self._keyframe_poses()
         self._refine(poses, np.ones(len(self._landmarks), np.bool_))
         self._points = self._landmarks.points(poses)
 
-    def _condenser(self, use: BoolArray, with_map: bool) -> Condenser:
+    def _condenser(self, use: BoolArray, map_intervals: range) -> Condenser:
+        """Return what linearises the used landmarks, and the map constraints of the stripes in some of the intervals."""
+
         def linearise(T_map_imu: FloatArray) -> Quadratic:
             poses = T_map_imu @ self._T_imu_cam
             self._refine(poses, use)
             quadratic = condense(self._landmarks.arrays, poses, use, self._config.cauchy)
-            if with_map and self.constraints is not None and len(self.constraints):
+            if self.constraints is not None and len(self.constraints) and len(map_intervals):
                 quadratic = quadratic + condense_map(
                     self.constraints,
                     self._window.stamps,
                     self._window.intervals,
+                    map_intervals,
                     poses,
                     self._config.map_sigma_scale,
                     self._config.map_cauchy,
@@ -272,8 +285,10 @@ class WindowEstimator:
         if full:
             leaving = self._landmarks.split()
             stays = self._landmarks.usable & ~leaving
+            # What the map says of the oldest interval leaves with it; the rest goes on holding the window.
+            oldest, rest = range(1), range(1, len(self._window.intervals))
             self._smoother.marginalise_oldest(
-                self._condenser(self._landmarks.usable & leaving, False), self._condenser(stays, False)
+                self._condenser(self._landmarks.usable & leaving, oldest), self._condenser(stays, rest)
             )
             self._landmarks.drop_oldest(leaving)
             self._window.drop_oldest()
@@ -329,7 +344,12 @@ class WindowEstimator:
         )
 
 
+def _range_m(calibration: Calibration) -> tuple[float, float]:
+    """Return the nearest and the farthest surface, metres."""
+    return calibration.laser.range_m if calibration.laser is not None else (0.02, 0.15)
+
+
 def _inverse_depth_limits(calibration: Calibration) -> tuple[float, float]:
-    """Return the inverse depths (1/m) that a landmark may have: the laser's range, generously."""
-    near, far = calibration.laser.range_m if calibration.laser is not None else (0.02, 0.15)
+    """Return the inverse depths (1/m) that a landmark may have: the scanner's range, generously."""
+    near, far = _range_m(calibration)
     return 0.3 / far, 3.0 / near

@@ -63,6 +63,7 @@ def condense_map(
     constraints: MapConstraints,
     stamps: Sequence[int],
     intervals: Sequence[Interval],
+    use: range,
     T_map_camera: FloatArray,
     sigma_scale: float,
     cauchy: float,
@@ -73,6 +74,7 @@ def condense_map(
         constraints: correspondences, held fixed.
         stamps: of the K keyframes.
         intervals: the K − 1 intervals between them.
+        use: which of the intervals take part.
         T_map_camera: linearisation point.
         sigma_scale: factor on the points' sigmas, for their correlation.
         cauchy: in sigmas.
@@ -85,7 +87,7 @@ def condense_map(
     slots = np.searchsorted(np.asarray(stamps), scan_stamps, side="right") - 1
     information = constraints.weight / (sigma_scale * constraints.sigma) ** 2
     for stamp, k, start, end in zip(scan_stamps, slots, starts, ends, strict=True):
-        if not 0 <= k < count - 1:
+        if k not in use:
             continue
         interval = intervals[k]
         index = int(np.searchsorted(interval.stamps, stamp))

@@ -180,3 +180,24 @@ def test_the_odometry_frame_is_continuous_across_keyframes() -> None:
     odometry = np.stack([(inverse(p.T_map_odom) @ p.T_map_imu)[:3, 3] for p in poses])
     steps = np.linalg.norm(np.diff(odometry, axis=0), axis=1)
     assert steps.max() < 0.014 / 30 * 3
+
+
+def test_features_that_are_nonsense_never_move_the_pose_out_of_reach() -> None:
+    scan = Scan()
+    back_end = BackEnd(calibration(), BackEndConfig(), Mode.VLI_ODOM)
+    rng = np.random.default_rng(0)
+    last: FloatArray | None = None
+    for item in scan.frames(5.0):
+        if isinstance(item, LaserScan):
+            back_end.add_scan(item)
+            continue
+        if 3e9 < item.tracks.stamp_ns - 1_000_000_000 < 3.4e9:
+            nonsense = rng.uniform(-0.7, 0.7, item.tracks.rays.shape)
+            item = dataclasses.replace(item, tracks=dataclasses.replace(item.tracks, rays=nonsense))
+        output = back_end.add_frame(item)
+        if output.pose is not None:
+            position = output.pose.T_map_imu[:3, 3]
+            assert last is None or np.linalg.norm(position - last) < 0.02
+            last = position
+        else:
+            last = None
