@@ -47,7 +47,10 @@ class Mapper:
     def add_window(self, window: WindowPoses) -> MappingOutput:
         """Take the poses after a solve; return constraints for the next one, the newest stripes, and what is new in the map."""
         session = window.session
-        if session != self._window.session:
+        if session < self._window.session:
+            self.counters.add("windows_of_old_session")
+            return MappingOutput()
+        if session > self._window.session:
             self.reset(session)
         self._window.update(window)
         touched = self._enter_leaving()

@@ -190,6 +190,16 @@ def test_a_new_session_starts_a_new_map_and_drops_what_belongs_to_the_old() -> N
     assert mapper.map.cloud().points[:, 1].min() > 0.007
 
 
+def test_a_late_window_of_an_old_session_changes_nothing() -> None:
+    mapper = Mapper(calibration())
+    run(mapper, 40, 61, session=1)
+    held = mapper.map
+    assert run(mapper, 0, 21, session=0) == MappingOutput()
+    assert mapper.map is held
+    assert mapper.counters["windows_of_old_session"] == 1
+    assert mapper.counters["scans_entered"] == 10
+
+
 def test_nothing_is_kept_of_what_is_done() -> None:
     mapper = Mapper(calibration())
     for start in range(0, 200, 20):
