@@ -127,10 +127,14 @@ class FrontEndConfig:
         100, unit="points", minimum=20, maximum=1000, doc="points tracked; more: steadier, slower (front and back end)"
     )
     sigma_px: float = parameter(
-        0.07, unit="px", minimum=0.01, maximum=5.0, doc="error of a young track per axis, on good texture"
+        0.04,
+        unit="px",
+        minimum=0.01,
+        maximum=5.0,
+        doc="least error of a track per axis; what its own alignment says comes on top",
     )
     sigma_growth_px: float = parameter(
-        0.008, unit="px a frame", minimum=0.0, maximum=1.0, doc="growth of a track's error with its age"
+        0.002, unit="px a frame", minimum=0.0, maximum=1.0, doc="growth of a track's error with its age; 0.008 without alignment"
     )
     klt: KltConfig = section(KltConfig)
     detection: DetectionConfig = section(DetectionConfig)

@@ -27,6 +27,12 @@ _UNKNOWNS = 10
 _WEIGHT_SIGMA_PX = 5.0
 _CONVERGED_PX = 0.01
 _ITERATIONS = 10
+_NOISE_CORRELATION = 3.0
+"""Error over the bound for white noise: demosaicing, low pass and interpolation correlate it between pixels; measured."""
+_DEFORMATION_PX = 0.08
+"""Where what is left is more than noise it is structure, which pulls harder: measured, see test/perf/bench_klt.py."""
+_EXPECTED_RESIDUAL = 1.1
+"""Grey levels left of a patch in the frame after its birth."""
 
 _DY, _DX = np.mgrid[-RADIUS : RADIUS + 1, -RADIUS : RADIUS + 1]
 # The corners of the square weigh less than 0.13; leaving them out saves a quarter of the time.
@@ -46,12 +52,14 @@ class Aligned:
         affine: (N, 2, 2), patch at birth → image.
         converged: (N,).
         correlation: (N,), weighted, of the patch with the one at birth under the fitted light.
+        sigma: (N,) standard deviation of ``pixels`` per axis, ``inf`` where not converged.
     """
 
     pixels: FloatArray
     affine: FloatArray
     converged: BoolArray
     correlation: FloatArray
+    sigma: FloatArray
 
 
 class PatchTemplates:
@@ -76,9 +84,24 @@ class PatchTemplates:
     def align(self, grey: ByteArray, slots: IntArray, start: FloatArray, affine: FloatArray) -> Aligned:
         """Find the patches of ``slots`` (N,) from positions (N, 2) and affine warps (N, 2, 2)."""
         pixels, warps = start.copy(), affine.copy()
-        converged, correlation = np.zeros(len(slots), np.bool_), np.zeros(len(slots))
-        _align(grey, slots, self._solvers, self._patches, self.valid, pixels, warps, converged, correlation)
-        return Aligned(pixels, warps, converged, correlation)
+        converged = np.zeros(len(slots), np.bool_)
+        correlation, residual = np.zeros(len(slots)), np.full(len(slots), np.inf)
+        _align(grey, slots, self._solvers, self._patches, self.valid, pixels, warps, converged, correlation, residual)
+        return Aligned(pixels, warps, converged, correlation, self._sigma(slots, residual))
+
+    def initial_sigma(self, slots: IntArray) -> FloatArray:
+        """Return the standard deviation (N,) to expect of the first alignment, pixels per axis."""
+        return self._sigma(slots, np.full(len(slots), _EXPECTED_RESIDUAL))
+
+    def _sigma(self, slots: IntArray, residual: FloatArray) -> FloatArray:
+        """Return pixels (N,) from what is left of each patch (N,), grey levels: the a-posteriori error of the fit.
+
+        What is left is noise at first; it grows as the view changes, and across a depth edge, where nothing else tells that the
+        position is wrong.
+        """
+        sigma = residual * self.sigma_per_level[slots]
+        result: FloatArray = _NOISE_CORRELATION * sigma * (1.0 + (sigma / _DEFORMATION_PX) ** 2)
+        return result
 
 
 @njit(cache=True, fastmath=True, error_model="numpy")
@@ -235,8 +258,8 @@ def _compose(pixel: FloatArray, warp: FloatArray, unknowns: FloatArray) -> float
 
 
 @njit(cache=True, fastmath=True)
-def _correlation(patch: Float32Array, values: Float32Array, unknowns: FloatArray) -> float:
-    """Return the weighted correlation of the values with the patch under the fitted light."""
+def _agreement(patch: Float32Array, values: Float32Array, unknowns: FloatArray) -> tuple[float, float]:
+    """Return the weighted correlation of the values with the patch under the fitted light, and the RMS of what differs."""
     mean = 0.0
     for k in range(_PIXELS):
         mean += patch[k] / _PIXELS
@@ -251,7 +274,11 @@ def _correlation(patch: Float32Array, values: Float32Array, unknowns: FloatArray
         sum_vv += weight * value * value
         sum_mv += weight * model * value
     product = (sum_mm * weights - sum_m * sum_m) * (sum_vv * weights - sum_v * sum_v)
-    return (sum_mv * weights - sum_m * sum_v) / math.sqrt(product) if product > 0.0 else 0.0
+    if product <= 0.0:
+        return 0.0, np.inf
+    correlation = (sum_mv * weights - sum_m * sum_v) / math.sqrt(product)
+    variance = (sum_vv * weights - sum_v * sum_v) / (weights * weights)
+    return correlation, math.sqrt(variance * max(0.0, 1.0 - correlation * correlation))
 
 
 @njit(cache=True)
@@ -265,6 +292,7 @@ def _align(
     warps: FloatArray,
     converged: BoolArray,
     correlation: FloatArray,
+    residual: FloatArray,
 ) -> None:
     values, unknowns = np.empty(_PIXELS, np.float32), np.empty(_UNKNOWNS)
     for n in range(len(slots)):
@@ -283,7 +311,7 @@ def _align(
                 break
             if step < _CONVERGED_PX:
                 converged[n] = True
-                correlation[n] = _correlation(patches[slot], values, unknowns)
+                correlation[n], residual[n] = _agreement(patches[slot], values, unknowns)
                 break
         if not converged[n]:
             pixels[n, 0], pixels[n, 1] = start_x, start_y

@@ -16,6 +16,9 @@ from vli_frontend.outliers import OutlierRejection
 from vli_frontend.patch_alignment import MARGIN_PX, PatchTemplates
 from vli_frontend.photometry import Frame
 
+_MAX_SIGMA_PX = 2.0
+"""A position that is worse is of no use, whatever its own estimate: keeps infinities out of the messages."""
+
 
 @dataclass(slots=True)
 class TrackTable:
@@ -30,6 +33,7 @@ class TrackTable:
         age: (N,) frames since the template was taken.
         slots: (N,) of the template.
         affine: (N, 2, 2), patch at birth → newest frame.
+        sigma: (N,) pixels per axis, of the newest position against the patch at birth.
         flags: (N,) uint8, of the newest frame.
     """
 
@@ -41,18 +45,22 @@ class TrackTable:
     age: IntArray
     slots: IntArray
     affine: FloatArray
+    sigma: FloatArray
     flags: ByteArray
 
     def __len__(self) -> int:
         return len(self.ids)
 
     @staticmethod
-    def new(ids: IntArray, pixels: FloatArray, rays: FloatArray, slots: IntArray, flow: FloatArray) -> TrackTable:
+    def new(
+        ids: IntArray, pixels: FloatArray, rays: FloatArray, slots: IntArray, flow: FloatArray, sigma: FloatArray
+    ) -> TrackTable:
         """Return tracks seen for the first time; ``flow`` (2,) is the guess for all."""
         n = len(ids)
         affine = np.tile(np.eye(2), (n, 1, 1))
         flags = np.full(n, int(TrackFlag.NEW), np.uint8)
-        return TrackTable(ids, pixels, rays, np.zeros((n, 2)), np.tile(flow, (n, 1)), np.zeros(n, np.int64), slots, affine, flags)
+        age = np.zeros(n, np.int64)
+        return TrackTable(ids, pixels, rays, np.zeros((n, 2)), np.tile(flow, (n, 1)), age, slots, affine, sigma, flags)
 
     def keep(self, mask: BoolArray) -> None:
         """Drop the tracks where ``mask`` (N,) is False."""
@@ -83,16 +91,17 @@ class Tracker:
     def reset(self) -> None:
         """Forget all tracks; ids start at 1 again."""
         none, nowhere = np.empty(0, np.int64), np.empty((0, 2))
-        self.tracks = TrackTable.new(none, nowhere, nowhere, none, np.zeros(2))
+        self.tracks = TrackTable.new(none, nowhere, nowhere, none, np.zeros(2), np.empty(0))
         self._previous: Frame | None = None
         self._next_id = 1
         self._outliers.reset()
 
     @property
     def sigma_px(self) -> FloatArray:
-        """Standard deviation (N,) of each position per axis: that of the texture, growing with the age of the patch."""
-        config = self._config
-        result: FloatArray = np.hypot(config.sigma_px, config.sigma_growth_px * self.tracks.age)
+        """Standard deviation (N,) of each position per axis: that of the alignment, growing with the age of the patch."""
+        config, tracks = self._config, self.tracks
+        measured = np.clip(tracks.sigma, config.sigma_px, _MAX_SIGMA_PX)
+        result: FloatArray = np.hypot(measured, config.sigma_growth_px * tracks.age)
         return result
 
     def follow(self, frame: Frame, dt_s: float, rotation: FloatArray | None) -> None:
@@ -117,7 +126,8 @@ class Tracker:
         self._next_id += count
         self._templates.create(frame.grey, slots, pixels)
         flow = np.median(tracks.flow, axis=0) if len(tracks) else np.zeros(2)
-        tracks.extend(TrackTable.new(ids, pixels, self._camera.unproject(pixels), slots, flow))
+        sigma = self._templates.initial_sigma(slots)
+        tracks.extend(TrackTable.new(ids, pixels, self._camera.unproject(pixels), slots, flow, sigma))
         self._counters.add("tracks_started", count)
 
     def _advance(self, previous: Frame, frame: Frame, dt_s: float, rotation: FloatArray | None) -> None:
@@ -158,6 +168,7 @@ class Tracker:
         tracks.age[~good] = 0
         tracks.flags[~good] |= int(TrackFlag.TEMPLATE)
         self._templates.create(grey, tracks.slots[~good], tracks.pixels[~good])
+        tracks.sigma = np.where(good, aligned.sigma, self._templates.initial_sigma(tracks.slots))
         self._counters.add("templates_renewed", int((~good).sum()))
 
     def _reject(self, dt_s: float, rotation: FloatArray | None) -> None:

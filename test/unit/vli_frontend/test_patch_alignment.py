@@ -98,3 +98,23 @@ def test_the_bound_on_the_position_predicts_its_scatter_under_noise(pattern: Byt
     predicted = noise * templates.sigma_per_level[SLOTS]
     assert np.all(measured < 1.1 * predicted)
     assert np.all(measured > 0.4 * predicted)
+
+
+def test_sigma_follows_the_noise_and_is_infinite_where_nothing_is_found(pattern: ByteArray) -> None:
+    templates = PatchTemplates(6)
+    templates.create(pattern, SLOTS, POINTS)
+    rng = np.random.default_rng(2)
+    noisy = [np.clip(pattern + noise * rng.standard_normal(pattern.shape), 0, 255).astype(np.uint8) for noise in (1.0, 4.0)]
+    little, much = (templates.align(image, SLOTS, POINTS, IDENTITY).sigma for image in noisy)
+    assert np.all(much > 2 * little)
+    assert np.isinf(templates.align(np.full_like(pattern, 90), SLOTS, POINTS, IDENTITY).sigma).all()
+
+
+def test_sigma_tells_a_patch_across_a_depth_edge(pattern: ByteArray) -> None:
+    """The right half of each patch moves by half a pixel more than the left one."""
+    near, far = (warped(pattern, np.eye(2), np.array([shift, 0.0])) for shift in (0.5, 0.0))
+    split = far.copy()
+    for x, y in POINTS.round().astype(int):
+        split[y - 20 : y + 21, x : x + 20] = near[y - 20 : y + 21, x : x + 20]
+    whole, torn = align(pattern, far, POINTS), align(pattern, split, POINTS)
+    assert np.all(torn.sigma > 2 * whole.sigma)
