@@ -8,55 +8,111 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numba
 import numpy as np
 
 from vli_backend.condense import Quadratic
 from vli_backend.window import Interval
-from vli_common.arrays import FloatArray
-from vli_common.geometry import inverse, skew, so3_exp, so3_log, so3_right_jacobian
+from vli_common.arrays import FloatArray, IntArray
+from vli_common.geometry import interpolate
 from vli_common.types import MapConstraints
 
 
+@numba.njit(cache=True)
+def _skew(v):  # type: ignore[no-untyped-def]
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+@numba.njit(cache=True)
+def _log(r):  # type: ignore[no-untyped-def]
+    axis = 0.5 * np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
+    sine = np.sqrt(axis[0] ** 2 + axis[1] ** 2 + axis[2] ** 2)
+    angle = np.arctan2(sine, 0.5 * (r[0, 0] + r[1, 1] + r[2, 2] - 1.0))
+    return axis * (angle / sine if sine > 1e-12 else 1.0)
+
+
+@numba.njit(cache=True)
+def _right_jacobian(phi):  # type: ignore[no-untyped-def]
+    angle, k = np.sqrt((phi**2).sum()), _skew(phi)
+    if angle < 1e-6:
+        return np.eye(3) - 0.5 * k
+    return np.eye(3) - (1.0 - np.cos(angle)) / angle**2 * k + (angle - np.sin(angle)) / angle**3 * (k @ k)
+
+
+@numba.njit(cache=True)
+def _inverse_right_jacobian(phi):  # type: ignore[no-untyped-def]
+    angle, k = np.sqrt((phi**2).sum()), _skew(phi)
+    if angle < 1e-3:
+        return np.eye(3) + 0.5 * k + k @ k / 12.0
+    return np.eye(3) + 0.5 * k + (1.0 / angle**2 - (1.0 + np.cos(angle)) / (2.0 * angle * np.sin(angle))) * (k @ k)
+
+
+@numba.njit(cache=True)
+def _exp(phi):  # type: ignore[no-untyped-def]
+    angle, k = np.sqrt((phi**2).sum()), _skew(phi)
+    if angle < 1e-9:
+        return np.eye(3) + k
+    return np.eye(3) + np.sin(angle) / angle * k + (1.0 - np.cos(angle)) / angle**2 * (k @ k)
+
+
+@numba.njit(cache=True)
 def stripe_jacobian(T0: FloatArray, T1: FloatArray, alpha: float, delta: FloatArray) -> FloatArray:
     """Return d[ω_s, v_s] / d[ω_0, v_0, ω_1, v_1] (6, 12) of T_s = interp(T0, T1, α) δ; right perturbations throughout."""
-    r0, r1 = T0[:3, :3], T1[:3, :3]
-    phi = so3_log(r0.T @ r1)
-    e = so3_exp(alpha * phi)
+    r0, r1 = T0[:3, :3].copy(), T1[:3, :3].copy()
+    phi = _log(r0.T @ r1)
+    e = _exp(alpha * phi)
     r = r0 @ e
-    jr = so3_right_jacobian(alpha * phi)
+    scaled = alpha * _right_jacobian(alpha * phi)
     out = np.zeros((6, 12))
-    out[:3, :3] = e.T - alpha * jr @ np.linalg.inv(so3_right_jacobian(-phi))
-    out[:3, 6:9] = alpha * jr @ np.linalg.inv(so3_right_jacobian(phi))
-    out[3:, 3:6] = (1 - alpha) * r.T @ r0
-    out[3:, 9:] = alpha * r.T @ r1
+    out[:3, :3] = e.T - scaled @ _inverse_right_jacobian(-phi)
+    out[:3, 6:9] = scaled @ _inverse_right_jacobian(phi)
+    out[3:, 3:6] = (1.0 - alpha) * (r.T @ r0)
+    out[3:, 9:] = alpha * (r.T @ r1)
     # T Exp(ξ) δ = T δ Exp(Ad_{δ⁻¹} ξ)
-    back = inverse(delta)
+    back = delta[:3, :3].T.copy()
     adjoint = np.zeros((6, 6))
-    adjoint[:3, :3] = adjoint[3:, 3:] = back[:3, :3]
-    adjoint[3:, :3] = skew(back[:3, 3]) @ back[:3, :3]
-    result: FloatArray = adjoint @ out
-    return result
+    adjoint[:3, :3] = back
+    adjoint[3:, 3:] = back
+    adjoint[3:, :3] = _skew(-(back @ delta[:3, 3].copy())) @ back
+    return adjoint @ out
 
 
-def stripe_system(
-    T: FloatArray, points: FloatArray, targets: FloatArray, normals: FloatArray, information: FloatArray, cauchy: float
-) -> tuple[FloatArray, FloatArray, float]:
-    """Return H (6, 6), g (6,) and the cost of one stripe's residuals r = n · (T v − v^g), [ω, v] of the stripe's pose.
+@numba.njit(cache=True)
+def _stripe_system(T, points, targets, normals, information, cauchy):  # type: ignore[no-untyped-def]
+    """Return H (6, 6), g (6,) and the cost of one stripe's residuals r = n · (T v − v^g), [ω, v] of the stripe's pose T."""
+    h, g, cost = np.zeros((6, 6)), np.zeros(6), 0.0
+    row, m = np.empty(6), np.empty(3)
+    for i in range(len(points)):
+        p, n = points[i], normals[i]
+        residual = 0.0
+        for a in range(3):
+            residual += n[a] * (T[a, 0] * p[0] + T[a, 1] * p[1] + T[a, 2] * p[2] + T[a, 3] - targets[i, a])
+            m[a] = T[0, a] * n[0] + T[1, a] * n[1] + T[2, a] * n[2]
+        squared = residual * residual * information[i]
+        w = information[i] / (1.0 + squared / (cauchy * cauchy))
+        cost += cauchy * cauchy * np.log1p(squared / (cauchy * cauchy))
+        row[0], row[1], row[2] = p[1] * m[2] - p[2] * m[1], p[2] * m[0] - p[0] * m[2], p[0] * m[1] - p[1] * m[0]
+        row[3], row[4], row[5] = m[0], m[1], m[2]
+        for a in range(6):
+            g[a] += w * row[a] * residual
+            for b in range(6):
+                h[a, b] += w * row[a] * row[b]
+    return h, g, cost
 
-    Args:
-        T: (4, 4) ``T_map_camera`` of the stripe.
-        points: (N, 3) v in the camera.
-        targets, normals: (N, 3) v^g, n^g in the map.
-        information: (N,) 1/m².
-        cauchy: in sigmas.
-    """
-    residual = np.einsum("ni,ni->n", normals, points @ T[:3, :3].T + T[:3, 3] - targets)
-    squared = residual**2 * information
-    weight = information / (1.0 + squared / cauchy**2)
-    local = normals @ T[:3, :3]
-    rows = np.concatenate([np.cross(points, local), local], axis=1)
-    weighted = rows * weight[:, None]
-    return weighted.T @ rows, weighted.T @ residual, float(cauchy**2 * np.log1p(squared / cauchy**2).sum())
+
+@numba.njit(cache=True)
+def _condense_stripes(  # type: ignore[no-untyped-def]
+    keyframes, poses, slots, alphas, deltas, starts, ends, points, targets, normals, information, cauchy, hessian, gradient
+):
+    cost = 0.0
+    for s in range(len(slots)):
+        a, b, k = starts[s], ends[s], slots[s]
+        h, g, c = _stripe_system(poses[s], points[a:b], targets[a:b], normals[a:b], information[a:b], cauchy)
+        jacobian = stripe_jacobian(keyframes[k], keyframes[k + 1], alphas[s], deltas[s])
+        hessian[6 * k : 6 * k + 12, 6 * k : 6 * k + 12] += jacobian.T @ h @ jacobian
+        gradient[6 * k : 6 * k + 12] += jacobian.T @ g
+        cost += c
+    return cost
 
 
 def condense_map(
@@ -79,34 +135,35 @@ def condense_map(
         sigma_scale: factor on the points' sigmas, for their correlation.
         cauchy: in sigmas.
     """
-    count = len(T_map_camera)
-    hessian, gradient, cost = np.zeros((6 * count, 6 * count)), np.zeros(6 * count), 0.0
+    size = 6 * len(T_map_camera)
+    hessian, gradient = np.zeros((size, size)), np.zeros(size)
     order = np.argsort(constraints.scan_stamps, kind="stable")
     scan_stamps, starts = np.unique(constraints.scan_stamps[order], return_index=True)
-    ends = [*starts[1:], len(order)]
-    slots = np.searchsorted(np.asarray(stamps), scan_stamps, side="right") - 1
+    ends = np.append(starts[1:], len(order))
+    slots, indices = _locate(scan_stamps, stamps, intervals, use)
+    found = indices >= 0
+    slots, indices = slots[found], indices[found]
+    if not len(slots):
+        return Quadratic(hessian, gradient, 0.0)
+    alphas = np.array([intervals[k].alpha[i] for k, i in zip(slots, indices, strict=True)])
+    deltas = np.stack([intervals[k].delta[i] for k, i in zip(slots, indices, strict=True)])
+    poses = interpolate(T_map_camera[slots], T_map_camera[slots + 1], alphas) @ deltas
     information = constraints.weight / (sigma_scale * constraints.sigma) ** 2
-    for stamp, k, start, end in zip(scan_stamps, slots, starts, ends, strict=True):
-        if k not in use:
-            continue
-        interval = intervals[k]
-        index = int(np.searchsorted(interval.stamps, stamp))
-        if index >= len(interval.stamps) or interval.stamps[index] != stamp:
-            continue
-        rows = order[start:end]
-        delta, alpha = interval.delta[index], float(interval.alpha[index])
-        jacobian = stripe_jacobian(T_map_camera[k], T_map_camera[k + 1], alpha, delta)
-        pose = interval.poses(T_map_camera[k], T_map_camera[k + 1])[index]
-        h, g, c = stripe_system(
-            pose,
-            constraints.points_camera[rows],
-            constraints.points_map[rows],
-            constraints.normals_map[rows],
-            information[rows],
-            cauchy,
-        )
-        span = slice(6 * k, 6 * k + 12)
-        hessian[span, span] += jacobian.T @ h @ jacobian
-        gradient[span] += jacobian.T @ g
-        cost += c
-    return Quadratic(hessian, gradient, cost)
+    columns = (constraints.points_camera, constraints.points_map, constraints.normals_map, information)
+    stripes = (T_map_camera, poses, slots, alphas, deltas, starts[found], ends[found])
+    sorted_columns = (np.ascontiguousarray(column[order]) for column in columns)
+    cost = _condense_stripes(*stripes, *sorted_columns, cauchy, hessian, gradient)  # type: ignore[call-arg]
+    return Quadratic(hessian, gradient, float(cost))
+
+
+def _locate(scan_stamps: IntArray, stamps: Sequence[int], intervals: Sequence[Interval], use: range) -> tuple[IntArray, IntArray]:
+    """Return the interval of each scan and its index there, −1 where it is in none of those used."""
+    slots = np.searchsorted(np.asarray(stamps), scan_stamps, side="right") - 1
+    indices = np.full(len(scan_stamps), -1)
+    for k in use:
+        inside = np.flatnonzero(slots == k)
+        at = np.searchsorted(intervals[k].stamps, scan_stamps[inside])
+        known = at < len(intervals[k].stamps)
+        known[known] = intervals[k].stamps[at[known]] == scan_stamps[inside][known]
+        indices[inside[known]] = at[known]
+    return slots, indices

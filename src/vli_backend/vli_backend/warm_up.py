@@ -9,8 +9,10 @@ from vli_backend.config import BackEndConfig
 from vli_backend.frame_pose import solve_frame_pose
 from vli_backend.landmarks import LandmarkTable
 from vli_backend.laser_depth import measure_slot
-from vli_common.geometry import interpolate
-from vli_common.types import LaserScan
+from vli_backend.map_residuals import condense_map
+from vli_backend.window import FrameRecord, close_interval
+from vli_common.arrays import FloatArray
+from vli_common.types import LaserScan, MapConstraints
 
 
 def warm_up() -> None:
@@ -31,4 +33,15 @@ def warm_up() -> None:
     condense(table.arrays, poses, table.usable, 1.0)
     found = table.points(poses)
     solve_frame_pose(poses[0], np.eye(6), found.positions, found.spread, rays, np.full(20, 1e-3), 1.0)
-    interpolate(poses[0], poses[1], 0.5)
+    _warm_up_map(poses, scan)
+
+
+def _warm_up_map(poses: FloatArray, scan: LaserScan) -> None:
+    """Relate a scan between two keyframes to the map, eq. (4)."""
+    between = LaserScan(1, scan.points, scan.pixels, scan.intensity, scan.sigma)
+    interval = close_interval([FrameRecord(0, poses[0], False), FrameRecord(2, poses[1], False)], [between])
+    count = len(scan)
+    normals = np.tile([0.0, 0.0, 1.0], (count, 1))
+    stamps, ones = np.ones(count, np.int64), np.ones(count)
+    constraints = MapConstraints(2, stamps, scan.points, scan.points, normals, scan.sigma, ones)
+    condense_map(constraints, [0, 2], [interval], range(1), poses, 1.0, 2.0)
