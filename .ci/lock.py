@@ -20,7 +20,9 @@ NOT_WITH_OLDEST_NUMPY = ("mypy", "ruff", "pre-commit", "scipy-stubs", "types-", 
 
 def requirements() -> list[str]:
     """Return the pinned top-level requirements, tools included."""
-    lines = [line.strip() for name in ("requirements.txt", "requirements-dev.txt") for line in (ROOT / name).read_text().splitlines()]
+    lines = [
+        line.strip() for name in ("requirements.txt", "requirements-dev.txt") for line in (ROOT / name).read_text().splitlines()
+    ]
     return [line for line in lines if line and not line.startswith("#")]
 
 

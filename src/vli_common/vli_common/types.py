@@ -192,7 +192,7 @@ class Preintegration:
         stamp_ns: the frame it ends at (camera clock).
         from_ns: the keyframe it starts from (camera clock).
         measurements: a ``gtsam.PreintegratedCombinedMeasurements``.
-        inflate: factor on the covariance (> 1 where samples were missing or interpolated).
+        inflate: factor on the variances of the samples, already in ``measurements`` (> 1 where samples were interpolated).
     """
 
     stamp_ns: int

@@ -16,12 +16,19 @@ _INTEGRATION_SIGMA = 1e-5
 """Of the position per √s, metres: what integrating in steps leaves out."""
 
 
-def combined_params(imu: ImuCalibration, config: ImuConfig) -> gtsam.PreintegrationCombinedParams:
-    """Return GTSAM's noise parameters (continuous-time variances) for a calibrated IMU, gravity along −z."""
+def combined_params(imu: ImuCalibration, config: ImuConfig, inflate: float = 1.0) -> gtsam.PreintegrationCombinedParams:
+    """Return GTSAM's noise parameters (continuous-time variances) for a calibrated IMU, gravity along −z.
+
+    Args:
+        imu: noise of the calibration.
+        config: factors on it.
+        inflate: factor on the variances of the measurements, for samples that are interpolated across a gap.
+    """
     params = gtsam.PreintegrationCombinedParams.MakeSharedU(GRAVITY)
     accelerometer = max(imu.accelerometer_noise_density, config.accelerometer_noise)
-    params.setAccelerometerCovariance(np.eye(3) * accelerometer**2)
-    params.setGyroscopeCovariance(np.eye(3) * (config.gyroscope_factor * imu.gyroscope_noise_density) ** 2)
+    gyroscope = config.gyroscope_factor * imu.gyroscope_noise_density
+    params.setAccelerometerCovariance(np.eye(3) * inflate * accelerometer**2)
+    params.setGyroscopeCovariance(np.eye(3) * inflate * gyroscope**2)
     params.setBiasAccCovariance(np.eye(3) * (config.walk_factor * imu.accelerometer_random_walk) ** 2)
     params.setBiasOmegaCovariance(np.eye(3) * (config.walk_factor * imu.gyroscope_random_walk) ** 2)
     params.setIntegrationCovariance(np.eye(3) * _INTEGRATION_SIGMA**2)
@@ -42,6 +49,7 @@ class Preintegrator:
     """
 
     def __init__(self, imu: ImuCalibration, config: ImuConfig, synchroniser: Synchroniser, counters: Counters) -> None:
+        self._imu, self._config = imu, config
         self._params = combined_params(imu, config)
         self._interpolated_ns, self._longest_ns = seconds_to_ns(config.interpolated_gap_s), seconds_to_ns(config.longest_gap_s)
         self._synchroniser = synchroniser
@@ -73,10 +81,11 @@ class Preintegrator:
         inflate = max(1.0, segment.longest_gap_ns / max(self._interpolated_ns, 1)) ** 2
         if inflate > 1.0:
             self._counters.add("intervals_inflated")
-        return Preintegration(stamp_ns, self._from_ns, self._integrate(segment), inflate, session)
+        return Preintegration(stamp_ns, self._from_ns, self._integrate(segment, inflate), inflate, session)
 
-    def _integrate(self, segment: ImuSegment) -> gtsam.PreintegratedCombinedMeasurements:
-        measurements = gtsam.PreintegratedCombinedMeasurements(self._params, self._interval_bias)
+    def _integrate(self, segment: ImuSegment, inflate: float) -> gtsam.PreintegratedCombinedMeasurements:
+        params = self._params if inflate == 1.0 else combined_params(self._imu, self._config, inflate)
+        measurements = gtsam.PreintegratedCombinedMeasurements(params, self._interval_bias)
         accel, gyro = _midpoints(segment.accel), _midpoints(segment.gyro)
         for a, w, dt in zip(accel, gyro, (np.diff(segment.stamps) * 1e-9).tolist(), strict=True):
             measurements.integrateMeasurement(a, w, dt)

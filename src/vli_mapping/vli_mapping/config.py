@@ -12,26 +12,41 @@ class MapConfig:
     """What one point of the map is, and what may merge with it."""
 
     merge_radius: float = parameter(
-        1.5e-4, unit="m", minimum=1.0e-5, maximum=1.0e-2,
+        1.5e-4,
+        unit="m",
+        minimum=1.0e-5,
+        maximum=1.0e-2,
         doc="nearer points become one; larger: fewer points, less noise, less detail",
     )
     merge_angle_deg: float = parameter(
         45.0, unit="deg", minimum=5.0, maximum=90.0, doc="normals farther apart do not merge; larger: rounds edges off"
     )
     merge_colour: float = parameter(
-        60.0, unit="grey levels", minimum=1.0, maximum=255.0,
+        60.0,
+        unit="grey levels",
+        minimum=1.0,
+        maximum=255.0,
         doc="colours farther apart, in any channel, do not merge; larger: blurs print",
     )
     max_weight: float = parameter(
-        20.0, unit="points", minimum=1.0, maximum=1.0e6,
+        20.0,
+        unit="points",
+        minimum=1.0,
+        maximum=1.0e6,
         doc="cap on the points merged, lest old ones drown the rest; larger: slower to follow",
     )
     normal_radius: float = parameter(
-        8.0e-4, unit="m", minimum=1.0e-4, maximum=1.0e-2,
+        8.0e-4,
+        unit="m",
+        minimum=1.0e-4,
+        maximum=1.0e-2,
         doc="neighbours that give a normal; larger: less noise, rounds edges off",
     )
     fill_radius: float = parameter(
-        4.0e-4, unit="m", minimum=0.0, maximum=1.0e-2,
+        4.0e-4,
+        unit="m",
+        minimum=0.0,
+        maximum=1.0e-2,
         doc="doubtful points stay only where no solid one is this near; larger: fewer outliers, gaps",
     )
     min_planarity: float = parameter(
@@ -50,19 +65,30 @@ class EntryConfig:
         1, unit="points", minimum=0, maximum=20, doc="points doubted on either side of such a step: half a spot each, they fly"
     )
     min_segment: int = parameter(
-        5, unit="points", minimum=1, maximum=1000,
+        5,
+        unit="points",
+        minimum=1,
+        maximum=1000,
         doc="shorter pieces between two steps are doubted; larger: fewer ghosts, less detail",
     )
     support_radius: float = parameter(
-        1.0e-3, unit="m", minimum=1.0e-4, maximum=1.0e-2,
+        1.0e-3,
+        unit="m",
+        minimum=1.0e-4,
+        maximum=1.0e-2,
         doc="a neighbouring scan must have seen something this near; smaller: fewer ghosts",
     )
     max_incidence_deg: float = parameter(
-        82.0, unit="deg", minimum=30.0, maximum=90.0,
+        82.0,
+        unit="deg",
+        minimum=30.0,
+        maximum=90.0,
         doc="a view farther from the normal is grazing and doubted; larger: steeper flanks, noisier",
     )
     max_blur: float = parameter(
-        2.0, minimum=1.0, maximum=100.0,
+        2.0,
+        minimum=1.0,
+        maximum=100.0,
         doc="doubtful points noisier than this many times the stripe's median are dropped; smaller: fewer outliers",
     )
 
@@ -72,11 +98,17 @@ class AssociationConfig:
     """Window-to-map correspondences, eq. (4)."""
 
     points_per_scan: int = parameter(
-        25, unit="points", minimum=1, maximum=1000,
+        25,
+        unit="points",
+        minimum=1,
+        maximum=1000,
         doc="stripe points of each scan that look for the map; more: slower, hardly better",
     )
     gate: float = parameter(
-        1.0e-3, unit="m", minimum=1.0e-4, maximum=1.0e-2,
+        1.0e-3,
+        unit="m",
+        minimum=1.0e-4,
+        maximum=1.0e-2,
         doc="farthest map point that may correspond; larger: captures more drift, wrong edges",
     )
     max_angle_deg: float = parameter(
@@ -95,11 +127,17 @@ class AssociationConfig:
         6, unit="points", minimum=3, maximum=1000, doc="fewest map points of a plane that constrains; larger: sturdier, fewer"
     )
     sigma_floor: float = parameter(
-        1.5e-4, unit="m", minimum=1.0e-6, maximum=1.0e-2,
+        1.5e-4,
+        unit="m",
+        minimum=1.0e-6,
+        maximum=1.0e-2,
         doc="point-to-plane sigma that is not in the noise of the points: poses of the map",
     )
     min_constraints: int = parameter(
-        30, unit="points", minimum=1, maximum=100000,
+        30,
+        unit="points",
+        minimum=1,
+        maximum=100000,
         doc="fewer correspondences in a window are not sent: they could be wrong together",
     )
 
@@ -112,7 +150,10 @@ class MappingConfig:
     entry: EntryConfig = section(EntryConfig)
     association: AssociationConfig = section(AssociationConfig)
     image_buffer_s: float = parameter(
-        10.0, unit="s", minimum=0.1, maximum=60.0,
+        10.0,
+        unit="s",
+        minimum=0.1,
+        maximum=60.0,
         doc="long images wait this long for the poses of their scans; longer: more memory",
     )
     colour_gap_s: float = parameter(

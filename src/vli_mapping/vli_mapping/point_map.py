@@ -20,7 +20,6 @@ UNKNOWN_COLOUR = 128
 _GROWTH = 1.5
 
 
-
 @dataclass
 class Columns:
     """The arrays of a map, one row a point; rows beyond the map's length are room to grow.
