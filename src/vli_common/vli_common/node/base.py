@@ -134,6 +134,7 @@ class VliNode(Node):
         name: str | None = None,
         ends: bool = True,
         required: bool = True,
+        limit: int | None = None,
     ) -> None:
         """Subscribe; ``read`` and ``handle`` run in the worker.
 
@@ -144,15 +145,16 @@ class VliNode(Node):
             name: to subscribe to in place of the topic's own.
             ends: False for feedback, which does not tell the end of the input.
             required: False for an input that may have no publisher.
+            limit: messages that may wait for the worker, by default 12 times the depth of the topic.
         """
         entry = _Input(topic, name or topic.name, ends, required)
-        limit = _QUEUE_DEPTHS * topic.depth
+        most = limit or _QUEUE_DEPTHS * topic.depth
 
         def accept(message: Any) -> None:
             entry.rate.add()
             entry.received += 1
             entry.last_s = time.monotonic()
-            self._worker.put(topic.name, partial(self._process, entry, read, handle, message, entry.last_s), limit)
+            self._worker.put(topic.name, partial(self._process, entry, read, handle, message, entry.last_s), most)
 
         def callback(message: Any) -> None:
             accept(message)

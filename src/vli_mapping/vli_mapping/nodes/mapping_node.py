@@ -6,6 +6,8 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+from sensor_msgs.msg import Image as ImageMessage
+
 from vli_common.calibration import Calibration
 from vli_common.config import parameter
 from vli_common.errors import OutputError
@@ -27,6 +29,8 @@ from vli_mapping.store import write_ply
 from vli_mapping.warm_up import warm_up
 
 _MAP_PERIOD_S = 2.0
+_WAITING_IMAGES = 300
+"""Ten seconds of long images, as many as the mapper keeps: a scan whose images were dropped would stay grey. 280 MB at VGA."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +49,7 @@ class MappingNode(VliNode):
         self._published_points = -1
         for topic in (CLOUD, MAP, MAP_UPDATE, MAP_CONSTRAINTS):
             self.advertise(topic)
-        self.receive(IMAGE_LONG, lambda message: image_from_message(message, self.session), self._on_image)
+        self.receive(IMAGE_LONG, self._read_image, self._on_image, limit=_WAITING_IMAGES)
         self.receive(LASER_POINTS, scan_from_message, self._on_scan)
         self.receive(WINDOW, window_from_message, self._on_window)
         self.serve("save", self._save)
@@ -78,6 +82,9 @@ class MappingNode(VliNode):
     def mapper(self) -> Mapper:
         """The mapper, which is there once the node is ready."""
         return self.existing(self._mapper)
+
+    def _read_image(self, message: ImageMessage) -> Image:
+        return image_from_message(message, self.session)
 
     def _on_image(self, image: Image) -> None:
         self.mapper.add_image(image)
