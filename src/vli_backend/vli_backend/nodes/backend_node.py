@@ -80,6 +80,7 @@ class BackEndNode(VliNode):
         self._back_end: BackEnd | None = None
         self._pairing = FramePairing()
         self._path: deque[Any] = deque(maxlen=_PATH_POSES)
+        self._poses = 0
         self._last = BackEndOutput(0, TrackingState.INITIALISING, "waiting for the first frame")
         for topic in (ODOMETRY, POSE, PATH, WINDOW, BIAS, *((TF, TF_STATIC) if TFMessage else ())):
             self.advertise(topic)
@@ -171,7 +172,8 @@ class BackEndNode(VliNode):
         if TFMessage:
             self.send(TF, TFMessage(transforms=pose_transforms(pose)))
         self._path.append(message)
-        if len(self._path) % _PATH_EVERY == 0 and self.has_listener(PATH):
+        self._poses += 1
+        if self._poses % _PATH_EVERY == 0 and self.has_listener(PATH):
             self.send(PATH, path_to_message(list(self._path)))
 
     def _send_window(self, window: WindowPoses | None) -> None:
