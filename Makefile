@@ -8,10 +8,14 @@ PACKAGES := $(patsubst %/setup.py,%,$(wildcard src/*/setup.py))
 BUILD_FILES := $(wildcard src/*/setup.py src/*/setup.cfg src/*/pyproject.toml)
 INSTALL := -m pip install --quiet --disable-pip-version-check
 BIN := $(VENV)/bin
+# Where the tests, too, look for it by default.
+RECORDING := ../shared/data/keyboard_short
+REDUCE := import sys, cv2; whole = cv2.imread(sys.argv[1]); \
+	cv2.imwrite(sys.argv[2], cv2.resize(whole, (1600, 1000), interpolation=cv2.INTER_AREA), [cv2.IMWRITE_PNG_COMPRESSION, 9])
 # Tests start ROS graphs of their own: they must not meet those of others on the network.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 
-.PHONY: demo test test-all lint format bench venv config lock clean
+.PHONY: demo test test-all lint format bench pictures venv config lock clean
 
 demo: venv
 	$(BIN)/vli demo
@@ -51,6 +55,19 @@ format: venv
 
 bench: venv
 	$(BIN)/python -m pytest -m perf -q test/perf
+	@for script in $(wildcard test/perf/bench_*.py); do \
+		echo "== $$script"; \
+		test -d $(RECORDING) || { echo "skipped: needs the recording '$(RECORDING)'"; continue; }; \
+		$(BIN)/python $$script || failed=1; \
+	done; exit $${failed:-0}
+
+# The picture of the README: cloud.png, smaller, so that the page loads at once.
+pictures: venv
+	scan=$$(mktemp -d) && \
+	$(BIN)/vli run bags/demo/bag --calib bags/demo/calibration.yaml --out $$scan/out && \
+	mkdir -p docs/images && \
+	$(BIN)/python -c '$(REDUCE)' $$scan/out/cloud.png docs/images/demo.png && \
+	rm -r $$scan
 
 config: venv
 	$(BIN)/python -m vli_bringup.settings > config/vli.yaml

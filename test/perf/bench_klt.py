@@ -1,11 +1,11 @@
 """Tracks against exact truth: lag and scatter by age, lost tracks, time a frame; plain Lucas–Kanade, normalised, with alignment.
 
-    python test/perf/bench_klt.py ../shared/data/keyboard_short [--frames 300]
+    python test/perf/bench_klt.py [RECORDING] [--frames 300]
 
-The directory holds ``bag``, ``calibration.yaml``, ``truth.tum`` and ``surface.ply``, as `vli simulate` writes them. The truth of
-a track is the surface point that its first pixel sees, projected into the later frames. *Lag* is the error along the true
-displacement, in % of it (negative: behind); *scatter* the RMS per axis of what remains. A patch across a depth edge has no single
-motion: such tracks are listed apart. Times are of the processor, one thread.
+RECORDING (default ``../shared/data/keyboard_short``) holds ``bag``, ``calibration.yaml``, ``truth.tum`` and ``surface.ply``, as
+`vli simulate` writes them. The truth of a track is the surface point that its first pixel sees, projected into the later frames.
+*Lag* is the error along the true displacement, in % of it (negative: behind); *scatter* the RMS per axis of what remains. A patch
+across a depth edge has no single motion: such tracks are listed apart. Times are of the processor, one thread.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from vli_frontend.warm_up import warm_up
 from vli_simulation.caster import RayCaster
 from vli_simulation.mesh import Mesh
 
+DATA = Path(__file__).resolve().parents[3] / "shared/data/keyboard_short"
 AGES = (1, 10, 30)
 _RECIPE = FrontEndConfig()
 TRACKERS = {
@@ -205,7 +206,7 @@ def errors_at(tracks: list[Track], outputs: list[FrontEndOutput], truth: Truth, 
 def main() -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("directory", type=Path)
+    parser.add_argument("directory", type=Path, nargs="?", default=DATA)
     parser.add_argument("--frames", type=int, default=750)
     parser.add_argument("--only", choices=list(TRACKERS))
     arguments = parser.parse_args()
