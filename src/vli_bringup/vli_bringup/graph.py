@@ -59,6 +59,7 @@ def describe_graph(
     imu_calibration: Path | None = None,
     playback: Playback | None = None,
     save_path: Path | None = None,
+    audience: str | None = None,
 ) -> list[NodeDescription]:
     """Return every node of the graph.
 
@@ -68,18 +69,20 @@ def describe_graph(
         imu_calibration: Kalibr's separate IMU file.
         playback: the bag to play; None for a graph that waits for a camera and an IMU.
         save_path: where mapping saves the map.
+        audience: a node outside the graph that the playback waits for as well.
     """
     shared: dict[str, Any] = {"mode": mode.value}
     source = {**shared, "calibration_file": str(calibration.absolute())}
     if imu_calibration is not None:
         source["imu_calibration_file"] = str(imu_calibration.absolute())
     if playback is not None:
+        awaited = [executable for _, executable in STAGES]
         source |= {
             "bag": str(playback.bag.absolute()),
             "rate": playback.rate,
             "start": playback.start_s,
             "duration": playback.duration_s or 0.0,
-            "wait_for": ",".join(executable for _, executable in STAGES),
+            "wait_for": ",".join([*awaited, audience] if audience else awaited),
         }
     own = {"mapping_node": {"save_path": str(save_path.absolute())}} if save_path is not None else {}
     nodes = [NodeDescription("vli_driver", SCANNER, source)]

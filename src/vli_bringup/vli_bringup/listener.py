@@ -8,18 +8,24 @@ from typing import Any
 
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
+from vli_bringup.graph import STAGES
 from vli_bringup.processes import GraphError
 from vli_bringup.recorder import Recorder
-from vli_common.messages import pose_from_message, status_from_message, window_from_message
+from vli_common.messages import pose_from_message, status_from_message, status_to_message, window_from_message
 from vli_common.node.transport import message_type, quality, set_transport_profile
-from vli_common.status import NodeState, StageStatus
+from vli_common.status import Health, NodeState, StageStatus
 from vli_common.topics import BIAS, NAMESPACE, POSE, STATUS, WINDOW, Topic
-from vli_common.types import TrackingState
+from vli_common.types import Counters, TrackingState
+
+LISTENER = "replay"
+"""Name of the node, for the ``wait_for`` of a driver that shall not play before it hears every stage."""
 
 _SPIN_S = 0.1
 _BACK_END = "backend_node"
+_RECORDED = (POSE, WINDOW)
 
 
 class GraphListener:
@@ -33,17 +39,19 @@ class GraphListener:
         self.statuses: dict[str, StageStatus] = {}
         """The newest status of each node."""
         self._recorder = recorder
+        self._received = Counters()
 
     def __enter__(self) -> GraphListener:
         """Join the graph."""
         set_transport_profile()
         rclpy.init(signal_handler_options=rclpy.SignalHandlerOptions.NO)
-        self._node = rclpy.create_node("replay", namespace=NAMESPACE)
+        self._node = rclpy.create_node(LISTENER, namespace=NAMESPACE)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
-        self._subscribe(POSE, lambda message: self._recorder.add_pose(*pose_from_message(message)))
-        self._subscribe(WINDOW, lambda message: self._recorder.add([window_from_message(message)]))
+        self._publisher = self._node.create_publisher(message_type(STATUS), STATUS.name, quality(STATUS))
         self._subscribe(STATUS, self._on_status)
+        recorded = [self._subscribe(POSE, self._on_pose), self._subscribe(WINDOW, self._on_window)]
+        self._recorded = dict(zip(_RECORDED, recorded, strict=True))
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -53,10 +61,11 @@ class GraphListener:
         rclpy.try_shutdown()
 
     def spin(self) -> None:
-        """Handle what comes within a tenth of a second."""
+        """Handle what comes within a tenth of a second, then say to the driver what is heard."""
         end_s = time.monotonic() + _SPIN_S
         while (left_s := end_s - time.monotonic()) > 0:
             self._executor.spin_once(left_s)
+        self._announce()
 
     def state(self, node: str) -> NodeState | None:
         """Return the state of a node, None where it has not been heard of."""
@@ -86,7 +95,8 @@ class GraphListener:
                 count = sent.get(name, 0) - int(value) if kind == "received" else int(value)
                 if count > 0:
                     lost[f"{node}.{name}"] = lost.get(f"{node}.{name}", 0) + count
-        return lost
+        missed = {f"{LISTENER}.{topic.name}": sent.get(topic.name, 0) - self._received[topic.name] for topic in _RECORDED}
+        return lost | {name: count for name, count in missed.items() if count > 0}
 
     def call(self, service: str, timeout_s: float) -> str:
         """Call ``node/service`` (std_srvs/Trigger) and return its answer.
@@ -107,11 +117,35 @@ class GraphListener:
         answer: str = response.message
         return answer
 
-    def _subscribe(self, topic: Topic, handle: Callable[[Any], None]) -> None:
-        self._node.create_subscription(message_type(topic), topic.name, handle, quality(topic, reading=True))
+    def _announce(self) -> None:
+        """Publish a status as the nodes do, once all stages are of one session.
+
+        A stage whose status has come has found this node, and what it will publish arrives; without this, a slow discovery
+        loses the first second of poses.
+        """
+        silent = [name for _, name in STAGES if name not in self.statuses]
+        sessions = {self.value(name, "session") for _, name in STAGES}
+        if len(sessions) > 1:
+            return
+        unmatched = [topic.name for topic, reader in self._recorded.items() if not reader.get_publisher_count()]
+        values = {"session": str(sessions.pop()), "unmatched": ",".join([*silent, *unmatched])}
+        self._publisher.publish(status_to_message(StageStatus(time.time_ns(), LISTENER, Health.OK, NodeState.READY, "", values)))
+
+    def _subscribe(self, topic: Topic, handle: Callable[[Any], None]) -> Subscription:
+        return self._node.create_subscription(message_type(topic), topic.name, handle, quality(topic, reading=True))
+
+    def _on_pose(self, message: Any) -> None:
+        self._received.add(POSE.name)
+        self._recorder.add_pose(*pose_from_message(message))
+
+    def _on_window(self, message: Any) -> None:
+        self._received.add(WINDOW.name)
+        self._recorder.add([window_from_message(message)])
 
     def _on_status(self, message: Any) -> None:
         status = status_from_message(message)
+        if status.node == LISTENER:
+            return
         self.statuses[status.node] = status
         if status.node == _BACK_END and "tracking" in status.values:
             values = status.values

@@ -15,7 +15,7 @@ from tqdm import tqdm
 from vli_bringup.arguments import add_scan_arguments, bag_topics, scan_settings
 from vli_bringup.graph import SCANNER, STAGES, Playback, describe_graph
 from vli_bringup.input_checks import check_input
-from vli_bringup.listener import GraphListener
+from vli_bringup.listener import LISTENER, GraphListener
 from vli_bringup.output import SUMMARY, ResultsDirectory
 from vli_bringup.processes import GraphError, NodeProcesses
 from vli_bringup.recorder import Recorder
@@ -97,7 +97,7 @@ def replay(options: ReplayOptions, directory: Path, started_s: float) -> dict[st
     parameter_file = directory / "config.yaml"
     parameter_file.write_text(to_yaml(options.settings))
     nodes = describe_graph(
-        options.calibration_path, options.mode, options.imu_calibration_path, options.playback, directory / _MAP
+        options.calibration_path, options.mode, options.imu_calibration_path, options.playback, directory / _MAP, LISTENER
     )
     with NodeProcesses(nodes, parameter_file) as processes, GraphListener(recorder) as listener:
         _wait_until_ready(processes, listener)
