@@ -98,7 +98,7 @@ class Pipeline:
         return [*events, *self._map(window)]
 
     def _begin_session(self, reason: str) -> list[Event]:
-        """Finish what the old clock began, then let every stage start anew."""
+        """Finish what the old clock began, then let every stage start anew; the mapper follows with its first new window."""
         events = self.flush()
         self.session += 1
         self.counters.add("sessions")
