@@ -96,7 +96,7 @@ class GtsamSmoother:
         tolerance: largest pose step (rad, m) at which the iteration stops.
     """
 
-    def __init__(self, keyframes: int, tolerance: tuple[float, float] = (1e-5, 1e-6)) -> None:
+    def __init__(self, keyframes: int, tolerance: tuple[float, float] = (3e-5, 2e-6)) -> None:
         self._keyframes = keyframes
         self._tolerance = tolerance
         parameters = gtsam.LevenbergMarquardtParams()

@@ -9,6 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 
 from vli_common.arrays import FloatArray
@@ -106,24 +107,33 @@ class RadtanCamera(CameraModel):
 
     def undistort(self, distorted: FloatArray) -> FloatArray:
         """See :meth:`CameraModel.undistort`; Newton's method with the exact Jacobian."""
-        k1, k2, p1, p2, k3 = self._parameters()
-        rays = distorted.copy()
+        distorted = np.ascontiguousarray(distorted, dtype=np.float64)
+        rays: FloatArray = _undistort_radtan(distorted, *self._parameters())
+        return rays
+
+
+@numba.njit(cache=True)
+def _undistort_radtan(distorted, k1, k2, p1, p2, k3):  # type: ignore[no-untyped-def]
+    """Newton's method, point by point; in numba since every feature and every calibration of the stripe passes here."""
+    rays = distorted.copy()
+    for i in range(len(distorted)):
+        x, y = distorted[i, 0], distorted[i, 1]
         for _ in range(_ITERATIONS):
-            x, y = rays[:, 0], rays[:, 1]
             r2 = x * x + y * y
             radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
             slope = 2 * (k1 + r2 * (2 * k2 + 3 * r2 * k3))
-            error_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) - distorted[:, 0]
-            error_y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y - distorted[:, 1]
+            error_x = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x) - distorted[i, 0]
+            error_y = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y - distorted[i, 1]
             jxx = radial + x * x * slope + 2 * p1 * y + 6 * p2 * x
             jxy = x * y * slope + 2 * p1 * x + 2 * p2 * y
             jyy = radial + y * y * slope + 6 * p1 * y + 2 * p2 * x
             det = jxx * jyy - jxy * jxy
-            step = np.stack([jyy * error_x - jxy * error_y, jxx * error_y - jxy * error_x], axis=1) / det[:, None]
-            rays -= step
-            if not np.abs(step).max(initial=0.0) > _CONVERGED:
+            step_x, step_y = (jyy * error_x - jxy * error_y) / det, (jxx * error_y - jxy * error_x) / det
+            x, y = x - step_x, y - step_y
+            if not abs(step_x) + abs(step_y) > _CONVERGED:
                 break
-        return rays
+        rays[i, 0], rays[i, 1] = x, y
+    return rays
 
 
 class EquidistantCamera(CameraModel):
