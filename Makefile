@@ -69,6 +69,9 @@ pictures: venv
 	$(BIN)/python -c '$(REDUCE)' $$scan/out/cloud.png docs/images/demo.png && \
 	rm -r $$scan
 
+bench-scenes: venv
+	$(BIN)/python test/perf/scenes.py
+
 config: venv
 	$(BIN)/python -m vli_bringup.settings > config/vli.yaml
 
