@@ -15,7 +15,7 @@ REDUCE := import sys, cv2; whole = cv2.imread(sys.argv[1]); \
 # Tests start ROS graphs of their own: they must not meet those of others on the network.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 
-.PHONY: demo test test-all lint format bench pictures venv config lock clean
+.PHONY: demo test test-all lint format bench bench-scenes pictures venv config lock clean
 
 demo: venv
 	$(BIN)/vli demo
