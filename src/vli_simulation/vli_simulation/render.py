@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, TypeVar, cast
 
 import cv2
 import numpy as np
@@ -17,6 +20,8 @@ from vli_simulation.optics import SUBPIXELS, Lens
 from vli_simulation.rig import Rig
 from vli_simulation.scenes.scene import Scene
 from vli_simulation.texture import noise_table
+
+T = TypeVar("T")
 
 _GREY_OF_WHITE = 330.0
 """Grey level of a white surface that faces the light at the nominal distance, in the nominal long exposure."""
@@ -42,6 +47,32 @@ class View:
         return self.T_world_cam[:3, 3]
 
 
+class Memory:
+    """The newest results of a computation that depends on the view alone: a camera at rest is rendered once.
+
+    Threads may compute the same view twice; the results are equal. They are shared, so nobody may write to them.
+    """
+
+    _SIZE = 12
+
+    def __init__(self) -> None:
+        self._results: dict[tuple[str, bytes], Any] = {}
+        self._lock = threading.Lock()
+
+    def recall(self, what: str, view: View, compute: Callable[[View], T]) -> T:
+        """Return ``compute(view)``, from memory where it is there."""
+        key = (what, b"".join((values + 0.0).tobytes() for values in (view.T_world_cam, view.velocity, view.rate)))
+        with self._lock:
+            if key in self._results:
+                return cast(T, self._results[key])
+        result = compute(view)
+        with self._lock:
+            while len(self._results) >= self._SIZE:
+                del self._results[next(iter(self._results))]
+            self._results[key] = result
+        return result
+
+
 @dataclass(frozen=True)
 class SeenPoints:
     """What the laser lights and the camera sees.
@@ -58,7 +89,7 @@ class SeenPoints:
 
 
 class Renderer:
-    """Renders a scene as a rig sees it; frames share no state, so that threads may use one renderer together."""
+    """Renders a scene as a rig sees it; threads may use one renderer together."""
 
     def __init__(self, scene: Scene, rig: Rig, config: SimulationConfig, seed: int) -> None:
         self.caster = RayCaster(scene.mesh)
@@ -76,27 +107,37 @@ class Renderer:
         self._table = noise_table(seed)
         self._lens = Lens(rig.camera, config.sensor.vignetting)
         self._grain = _grain_kernel(np.deg2rad(config.rig.stripe_angle_deg))
+        self._memory = Memory()
 
     def long_frame(self, view: View) -> Float32Array:
-        """Return the long exposure as light on an RGGB mosaic (H, W), in grey levels before sensor noise."""
+        """Return the long exposure as light on an RGGB mosaic (H, W), in grey levels before sensor noise; read only."""
+        return self._memory.recall("long", view, self._long_frame)
+
+    def _long_frame(self, view: View) -> Float32Array:
         radiance, depth = self._full_view(view)
         exposure = self._config.sensor.exposure_long_s
         return self._lens.expose(radiance, depth, view.velocity, view.rate, exposure, _GREY_OF_WHITE * exposure / _NOMINAL_LONG_S)
 
     def short_frame(self, view: View, rng: np.random.Generator) -> Float32Array:
         """Return the short exposure with the laser on, as :meth:`long_frame`; ``rng`` draws the speckle."""
-        radiance, depth = self._dim_view(view)
-        exposure = self._config.sensor.exposure_short_s
-        image = self._lens.expose(
-            radiance, depth, view.velocity, view.rate, exposure, _GREY_OF_WHITE * exposure / _NOMINAL_LONG_S
-        )
-        gain = _STRIPE_OF_WHITE * exposure / _NOMINAL_SHORT_S
-        self._lens.add_laser(self._speckled(self._stripe(view), rng), self._rig.laser.response, gain, image)
+        gain = _STRIPE_OF_WHITE * self._config.sensor.exposure_short_s / _NOMINAL_SHORT_S
+        image = self._memory.recall("dim", view, self._dim_frame).copy()
+        stripe = self._memory.recall("stripe", view, self._stripe).copy()
+        self._lens.add_laser(self._speckled(stripe, rng), self._rig.laser.response, gain, image)
         return image
 
+    def _dim_frame(self, view: View) -> Float32Array:
+        """Return the short exposure with the laser off."""
+        radiance, depth = self._dim_view(view)
+        exposure = self._config.sensor.exposure_short_s
+        return self._lens.expose(radiance, depth, view.velocity, view.rate, exposure, _GREY_OF_WHITE * exposure / _NOMINAL_LONG_S)
+
     def seen(self, view: View) -> SeenPoints:
-        """Return what the laser lights and the camera sees bright enough to be noticed."""
-        points, pixels = self._fan(view)
+        """Return what the laser lights and the camera sees bright enough to be noticed; read only."""
+        return self._memory.recall("seen", view, self._seen)
+
+    def _seen(self, view: View) -> SeenPoints:
+        points, pixels = self._memory.recall("fan", view, self._fan)
         buffer = self._look(view, transform(inverse(view.T_world_cam), points).astype(np.float32))
         albedo, radiance = self._light(view, buffer)
         nearest = np.clip(np.round(pixels).astype(np.int64), 0, [self._lens.width - 1, self._lens.height - 1])
@@ -164,7 +205,7 @@ class Renderer:
 
     def _band(self, view: View) -> IntArray:
         """Return the pixels (flat index) that the sheet may reach, around where its middle is seen."""
-        points, pixels = self._fan(view)
+        points, pixels = self._memory.recall("fan", view, self._fan)
         mask = np.zeros((self._lens.height, self._lens.width), np.uint8)
         if len(points):
             centre = np.clip(np.round(pixels).astype(np.int64), 0, [self._lens.width - 1, self._lens.height - 1])
