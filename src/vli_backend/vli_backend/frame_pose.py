@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numba
 import numpy as np
 
+from vli_backend.rotations import exp, log
 from vli_common.arrays import FloatArray
 
 _INLIER_SQUARED = 18.0
@@ -26,24 +27,6 @@ class FramePose:
     inliers: int
     rms: float
     iterations: int
-
-
-@numba.njit(cache=True)
-def _exp_so3(w):  # type: ignore[no-untyped-def]
-    angle = np.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
-    k = np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
-    if angle < 1e-9:
-        return np.eye(3) + k
-    return np.eye(3) + np.sin(angle) / angle * k + (1.0 - np.cos(angle)) / (angle * angle) * (k @ k)
-
-
-@numba.njit(cache=True)
-def _log_so3(r):  # type: ignore[no-untyped-def]
-    cosine = min(1.0, max(-1.0, 0.5 * (r[0, 0] + r[1, 1] + r[2, 2] - 1.0)))
-    angle = np.arccos(cosine)
-    v = np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
-    scale = 0.5 if angle < 1e-6 else angle / (2.0 * np.sin(angle))
-    return scale * v
 
 
 @numba.njit(cache=True)
@@ -75,7 +58,7 @@ def _solve(rotation, translation, points, weights, rays, prior, cauchy, iteratio
     j0, j1, delta, x = np.empty(6), np.empty(6), np.empty(6), np.empty(3)
     for step in range(iterations):
         done = step + 1
-        delta[:3] = _log_so3(start_r.T @ rotation)
+        delta[:3] = log(start_r.T @ rotation)
         delta[3:] = rotation.T @ (translation - start_t)
         h[:] = prior
         g[:] = prior @ delta
@@ -107,7 +90,7 @@ def _solve(rotation, translation, points, weights, rays, prior, cauchy, iteratio
                     h[m, n] += p * j0[n] + q * j1[n]
         update = -np.linalg.solve(h, g)
         translation = translation + rotation @ update[3:]
-        rotation = rotation @ _exp_so3(update[:3])
+        rotation = rotation @ exp(update[:3])
         if np.abs(update[:3]).max() < 1e-7 and np.abs(update[3:]).max() < 1e-9:
             break
     # One Newton step of the polar decomposition: poses are chained from frame to frame, and rounding errors would grow.

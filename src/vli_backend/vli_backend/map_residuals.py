@@ -12,6 +12,7 @@ import numba
 import numpy as np
 
 from vli_backend.condense import Quadratic
+from vli_backend.rotations import exp, inverse_right_jacobian, log, right_jacobian, skew
 from vli_backend.window import Interval
 from vli_common.arrays import FloatArray, IntArray
 from vli_common.geometry import interpolate
@@ -19,53 +20,16 @@ from vli_common.types import MapConstraints
 
 
 @numba.njit(cache=True)
-def _skew(v):  # type: ignore[no-untyped-def]
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
-
-
-@numba.njit(cache=True)
-def _log(r):  # type: ignore[no-untyped-def]
-    axis = 0.5 * np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
-    sine = np.sqrt(axis[0] ** 2 + axis[1] ** 2 + axis[2] ** 2)
-    angle = np.arctan2(sine, 0.5 * (r[0, 0] + r[1, 1] + r[2, 2] - 1.0))
-    return axis * (angle / sine if sine > 1e-12 else 1.0)
-
-
-@numba.njit(cache=True)
-def _right_jacobian(phi):  # type: ignore[no-untyped-def]
-    angle, k = np.sqrt((phi**2).sum()), _skew(phi)
-    if angle < 1e-6:
-        return np.eye(3) - 0.5 * k
-    return np.eye(3) - (1.0 - np.cos(angle)) / angle**2 * k + (angle - np.sin(angle)) / angle**3 * (k @ k)
-
-
-@numba.njit(cache=True)
-def _inverse_right_jacobian(phi):  # type: ignore[no-untyped-def]
-    angle, k = np.sqrt((phi**2).sum()), _skew(phi)
-    if angle < 1e-3:
-        return np.eye(3) + 0.5 * k + k @ k / 12.0
-    return np.eye(3) + 0.5 * k + (1.0 / angle**2 - (1.0 + np.cos(angle)) / (2.0 * angle * np.sin(angle))) * (k @ k)
-
-
-@numba.njit(cache=True)
-def _exp(phi):  # type: ignore[no-untyped-def]
-    angle, k = np.sqrt((phi**2).sum()), _skew(phi)
-    if angle < 1e-9:
-        return np.eye(3) + k
-    return np.eye(3) + np.sin(angle) / angle * k + (1.0 - np.cos(angle)) / angle**2 * (k @ k)
-
-
-@numba.njit(cache=True)
 def stripe_jacobian(T0: FloatArray, T1: FloatArray, alpha: float, delta: FloatArray) -> FloatArray:
     """Return d[ω_s, v_s] / d[ω_0, v_0, ω_1, v_1] (6, 12) of T_s = interp(T0, T1, α) δ; right perturbations throughout."""
     r0, r1 = T0[:3, :3].copy(), T1[:3, :3].copy()
-    phi = _log(r0.T @ r1)
-    e = _exp(alpha * phi)
+    phi = log(r0.T @ r1)
+    e = exp(alpha * phi)
     r = r0 @ e
-    scaled = alpha * _right_jacobian(alpha * phi)
+    scaled = alpha * right_jacobian(alpha * phi)
     out = np.zeros((6, 12))
-    out[:3, :3] = e.T - scaled @ _inverse_right_jacobian(-phi)
-    out[:3, 6:9] = scaled @ _inverse_right_jacobian(phi)
+    out[:3, :3] = e.T - scaled @ inverse_right_jacobian(-phi)
+    out[:3, 6:9] = scaled @ inverse_right_jacobian(phi)
     out[3:, 3:6] = (1.0 - alpha) * (r.T @ r0)
     out[3:, 9:] = alpha * (r.T @ r1)
     # T Exp(ξ) δ = T δ Exp(Ad_{δ⁻¹} ξ)
@@ -73,7 +37,7 @@ def stripe_jacobian(T0: FloatArray, T1: FloatArray, alpha: float, delta: FloatAr
     adjoint = np.zeros((6, 6))
     adjoint[:3, :3] = back
     adjoint[3:, 3:] = back
-    adjoint[3:, :3] = _skew(-(back @ delta[:3, 3].copy())) @ back
+    adjoint[3:, :3] = skew(-(back @ delta[:3, 3].copy())) @ back
     return adjoint @ out
 
 
