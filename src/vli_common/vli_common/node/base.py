@@ -312,7 +312,6 @@ class VliNode(Node):
         self.get_logger().error(f"{self.get_name()} failed: {self.failure}")
         self.get_logger().debug(traceback.format_exc())
         self.set_state(NodeState.FAILED, self.failure)
-        rclpy.try_shutdown()
 
     # Calibration
 

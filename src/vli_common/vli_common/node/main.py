@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
+import threading
 import time
 from collections.abc import Callable
 
 import rclpy
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
 
 from vli_common.errors import VliError
 from vli_common.node.base import VliNode
@@ -19,6 +22,8 @@ _SWITCH_S = 2e-4
 than a second while the worker computes."""
 _REST_S = 2e-3
 """What comes in this time is taken in one round of the executor; see :func:`vli_common.node.transport.pending`."""
+_SIGNAL_S = 0.1
+"""A signal is answered this late at most: the executor's wait does not end with it."""
 _UNUSABLE = 2
 _FAILED = 1
 
@@ -31,30 +36,9 @@ def run_node(factory: Callable[[], VliNode]) -> int:
     """
     sys.setswitchinterval(_SWITCH_S)
     set_transport_profile()
-    rclpy.init()
-    node: VliNode | None = None
-    code = 0
-    try:
-        node = factory()
-        node.start()
-        executor = SingleThreadedExecutor()
-        executor.add_node(node)
-        while True:
-            executor.spin_once()
-            time.sleep(_REST_S)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    except VliError as error:
-        code = _UNUSABLE
-        sys.stderr.write(f"{error}\n")
-    except Exception:
-        # A signal while the node is being made takes its context away: whatever that raises is no failure.
-        if rclpy.ok():
-            raise
-    stopped = True
-    if node is not None:
-        stopped = node.close()
-        code = code or (_FAILED if node.failure else 0)
+    stop = _stop_on_signals()
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    code, stopped = _run(factory, stop)
     rclpy.try_shutdown()
     if not stopped:
         # A kernel that is being compiled cannot be interrupted, and an interpreter must not end under it.
@@ -62,3 +46,43 @@ def run_node(factory: Callable[[], VliNode]) -> int:
         sys.stderr.flush()
         os._exit(code)
     return code
+
+
+def _run(factory: Callable[[], VliNode], stop: threading.Event) -> tuple[int, bool]:
+    """Return the exit code, and whether the node's own threads have ended."""
+    try:
+        node = factory()
+    except VliError as error:
+        sys.stderr.write(f"{error}\n")
+        return _UNUSABLE, True
+    code = 0
+    try:
+        node.start()
+        _spin(node, stop)
+    except VliError as error:
+        code = _UNUSABLE
+        sys.stderr.write(f"{error}\n")
+    finally:
+        stopped = node.close()
+    return code or (_FAILED if node.failure else 0), stopped
+
+
+def _spin(node: VliNode, stop: threading.Event) -> None:
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    while not stop.is_set() and node.failure is None:
+        executor.spin_once(timeout_sec=_SIGNAL_S)
+        time.sleep(_REST_S)
+    executor.shutdown(timeout_sec=0)
+
+
+def _stop_on_signals() -> threading.Event:
+    """Return what SIGINT and SIGTERM set.
+
+    A handler that raises (Python's own, and rclpy's shutdown) can do so in the middle of a constructor or a callback, and what it
+    leaves half made complains on standard error when it is collected.
+    """
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    return stop
