@@ -27,6 +27,7 @@ setup(
         "vli_frontend==0.1.0",
         "vli_backend==0.1.0",
         "vli_mapping==0.1.0",
+        "vli_calibration==0.1.0",
         "vli_simulation==0.1.0",
         "matplotlib>=3.6",
         "numpy>=1.26",

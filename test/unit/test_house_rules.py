@@ -20,7 +20,7 @@ STAGES = {"vli_driver", "vli_frontend", "vli_backend", "vli_mapping"}
 PACKAGES = sorted(path.parent.name for path in SOURCES.glob("*/package.xml"))
 MAY_IMPORT = {
     "vli_common": set(),
-    "vli_simulation": {"vli_common", "vli_driver"},
+    "vli_simulation": {"vli_common", "vli_driver", "vli_calibration"},
     "vli_calibration": {"vli_common", "vli_driver"},
     "vli_bringup": set(PACKAGES),
     **{stage: {"vli_common"} for stage in STAGES},

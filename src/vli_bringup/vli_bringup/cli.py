@@ -18,6 +18,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "run": ("vli_bringup.run", "a bag to trajectory and map, offline, as fast as the machine goes"),
     "replay": ("vli_bringup.replay", "a bag through the node graph, at the bag's pace"),
     "simulate": ("vli_simulation.cli", "make a bag with truth"),
+    "calibrate": ("vli_calibration.cli", "camera, laser plane, IMU: make a calibration and say what it is worth"),
     "eval": ("vli_bringup.evaluation", "compare the output of run or replay with the truth"),
 }
 """Name → module with ``add_arguments(parser)`` and ``run(args) -> int``, and the line in ``vli --help``."""
