@@ -45,7 +45,7 @@ class Quadratic:
         return Quadratic(hessian, gradient, self.constant)
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _relative_poses(rotations, translations):  # type: ignore[no-untyped-def]
     """Return R_ja (K, K, 3, 3) and t_ja (K, K, 3): points of frame a in frame j."""
     count = len(rotations)
@@ -60,7 +60,7 @@ def _relative_poses(rotations, translations):  # type: ignore[no-untyped-def]
     return r, t
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _refine(  # type: ignore[no-untyped-def]
     relative_r, relative_t, use, anchor, anchor_ray, rho, prior, rays, sigma, depth, depth_sigma, cauchy, limits, iterations
 ):
@@ -113,7 +113,7 @@ def _refine(  # type: ignore[no-untyped-def]
     return information
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _add_row(hessian, gradient, coupling, row, e, w, jr, a, j):  # type: ignore[no-untyped-def]
     """Add one residual row: ``row`` holds its Jacobian on the anchor pose, then on the frame's pose; ``jr`` that on ρ."""
     for m in range(12):
@@ -130,7 +130,7 @@ def _add_row(hessian, gradient, coupling, row, e, w, jr, a, j):  # type: ignore[
                 hessian[at_n, at_m] += weighted * row[n]
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _condense(  # type: ignore[no-untyped-def]
     relative_r, relative_t, use, anchor, anchor_ray, rho, prior, rays, sigma, depth, depth_sigma, cauchy, hessian, gradient
 ):

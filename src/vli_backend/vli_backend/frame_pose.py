@@ -29,7 +29,7 @@ class FramePose:
     iterations: int
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _weights(rotation, translation, points, spread, sigma):  # type: ignore[no-untyped-def]
     """Return the inverse covariances (N, 3: xx, xy, yy) of the residuals, σ² I + d dᵀ with d the depth's spread in the image.
 
@@ -50,7 +50,7 @@ def _weights(rotation, translation, points, spread, sigma):  # type: ignore[no-u
     return out
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _solve(rotation, translation, points, weights, rays, prior, cauchy, iterations):  # type: ignore[no-untyped-def]
     start_r, start_t = rotation.copy(), translation.copy()
     h, g = np.zeros((6, 6)), np.zeros(6)

@@ -155,7 +155,13 @@ class LandmarkTable:
 
     def points(self, poses: FloatArray) -> LandmarkPoints:
         """Return the landmarks whose tracks go on as points in map, keyframe poses ``T_map_camera`` (K, 4, 4) given."""
-        rows = np.flatnonzero(self.active)
+        return self._points(np.flatnonzero(self.active), poses)
+
+    def all_points(self, poses: FloatArray) -> LandmarkPoints:
+        """Like :meth:`points`, of all landmarks that were seen twice, those whose tracks have ended too."""
+        return self._points(np.flatnonzero(self.usable), poses)
+
+    def _points(self, rows: IntArray, poses: FloatArray) -> LandmarkPoints:
         arrays = self.arrays
         anchors, rho = poses[arrays.anchor[rows]], arrays.rho[rows]
         rays = np.concatenate([arrays.anchor_ray[rows], np.ones((len(rows), 1))], axis=1)

@@ -34,7 +34,7 @@ class LaserDepths:
     stripe_px: FloatArray
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _fit(features, rays, inverse, weight, radius, min_points, max_rms, out):  # type: ignore[no-untyped-def]
     order = np.argsort(rays[:, 0])
     sorted_x = rays[order, 0]

@@ -19,7 +19,7 @@ from vli_common.geometry import interpolate
 from vli_common.types import MapConstraints
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def stripe_jacobian(T0: FloatArray, T1: FloatArray, alpha: float, delta: FloatArray) -> FloatArray:
     """Return d[ω_s, v_s] / d[ω_0, v_0, ω_1, v_1] (6, 12) of T_s = interp(T0, T1, α) δ; right perturbations throughout."""
     r0, r1 = T0[:3, :3].copy(), T1[:3, :3].copy()
@@ -41,7 +41,7 @@ def stripe_jacobian(T0: FloatArray, T1: FloatArray, alpha: float, delta: FloatAr
     return adjoint @ out
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _stripe_system(T, points, targets, normals, information, cauchy):  # type: ignore[no-untyped-def]
     """Return H (6, 6), g (6,) and the cost of one stripe's residuals r = n · (T v − v^g), [ω, v] of the stripe's pose T."""
     h, g, cost = np.zeros((6, 6)), np.zeros(6), 0.0
@@ -64,7 +64,7 @@ def _stripe_system(T, points, targets, normals, information, cauchy):  # type: i
     return h, g, cost
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _condense_stripes(  # type: ignore[no-untyped-def]
     keyframes, poses, slots, alphas, deltas, starts, ends, points, targets, normals, information, cauchy, hessian, gradient
 ):

@@ -53,7 +53,7 @@ def structure_from_motion(
     T_cam_imu = calibration.T_cam_imu if calibration.T_cam_imu is not None else np.eye(4)
     focal = calibration.camera.focal_px
     rotations = chain_rotations(list(imu), T_cam_imu)
-    parallax = _parallax_px(tracks, rotations, focal)
+    parallax = parallax_px(tracks, rotations, focal)
     if parallax < config.start_parallax_px:
         return Structure(
             np.empty((0, 4, 4)), f"{parallax:.0f} px of parallax, {config.start_parallax_px:.0f} are needed: move sideways"
@@ -61,7 +61,7 @@ def structure_from_motion(
     table = LandmarkTable(max(len(tracks), 2))
     guess = 1.0 / float(np.median(np.concatenate([scan.points[:, 2] for scan in scans])))
     limits = (guess / 6.0, guess * 6.0)
-    poses = _chain(table, config, tracks, rotations, guess, focal, limits)
+    poses = chain_keyframes(table, config, tracks, rotations, guess, focal, limits)
     use = table.usable
 
     def linearise(T_world_camera: FloatArray) -> Quadratic:
@@ -77,7 +77,7 @@ def structure_from_motion(
     return Structure(poses @ T_cam_imu)
 
 
-def _parallax_px(tracks: list[Tracks], rotations: FloatArray, focal_px: float) -> float:
+def parallax_px(tracks: list[Tracks], rotations: FloatArray, focal_px: float) -> float:
     """Return the median rotation-compensated shift between the first and the last keyframe they share enough with."""
     first = tracks[0]
     best = 0.0
@@ -90,7 +90,7 @@ def _parallax_px(tracks: list[Tracks], rotations: FloatArray, focal_px: float) -
     return best
 
 
-def _chain(
+def chain_keyframes(
     table: LandmarkTable,
     config: BackEndConfig,
     tracks: list[Tracks],
@@ -111,7 +111,7 @@ def _chain(
             anchors = np.stack(poses)[arrays.anchor[rows[seen]]]
             rays = np.concatenate([arrays.anchor_ray[rows[seen]], np.ones((len(seen), 1))], axis=1)
             directions = np.einsum("nij,nj->ni", anchors[:, :3, :3], rays) / arrays.rho[rows[seen], None]
-            prior = np.diag(np.repeat([0.02**-2, 0.05**-2], 3))
+            prior = np.diag(np.repeat([0.02**-2, guess**2], 3))
             found = solve_frame_pose(
                 predicted, prior, directions + anchors[:, :3, 3], 0.1 * directions, track.rays[seen], sigma[seen], 2.0
             )

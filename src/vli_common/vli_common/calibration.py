@@ -91,8 +91,13 @@ class Calibration:
     document: dict[str, Any] = field(repr=False, compare=False, default_factory=dict)
 
 
-def load_calibration(path: Path, mode: Mode = Mode.VLI_SLAM, imu_path: Path | None = None) -> Calibration:
+def load_calibration(path: Path, mode: Mode | None = Mode.VLI_SLAM, imu_path: Path | None = None) -> Calibration:
     """Read and validate a calibration file (and Kalibr's separate IMU file).
+
+    Args:
+        path: the file.
+        mode: what the calibration must be complete for; None where cam0 is enough.
+        imu_path: Kalibr's ``imu.yaml``, in place of the section imu0.
 
     Raises:
         CalibrationError: naming every problem, and the command that makes a calibration.
@@ -102,17 +107,36 @@ def load_calibration(path: Path, mode: Mode = Mode.VLI_SLAM, imu_path: Path | No
     return parse_calibration(text, mode, str(path), imu_text)
 
 
-def parse_calibration(text: str, mode: Mode = Mode.VLI_SLAM, source: str = "topic", imu_text: str | None = None) -> Calibration:
+def load_document(path: Path) -> dict[str, Any]:
+    """Read a calibration file as it stands, complete or not.
+
+    Raises:
+        CalibrationError: no such file, or not YAML with sections.
+    """
+    return _parse_yaml(_read_text(path, f"make one with '{_CAMERA_COMMAND} {path}'"), str(path))
+
+
+def check_document(document: dict[str, Any], source: str) -> None:
+    """Validate the sections that are there, whichever they are.
+
+    Raises:
+        CalibrationError: naming every problem.
+    """
+    problems: list[str] = []
+    _read_sections(document, None, problems)
+    if problems:
+        raise CalibrationError(source, problems)
+
+
+def parse_calibration(text: str, mode: Mode | None = Mode.VLI_SLAM, source: str = "topic", imu_text: str | None = None) -> Calibration:
     """Like :func:`load_calibration`, from the text of the file."""
     document = _parse_yaml(text, source)
     if imu_text is not None:
         imu_document = _parse_yaml(imu_text, f"{source} (IMU file)")
         document["imu0"] = imu_document.get("imu0", imu_document)
     problems: list[str] = []
-    sections = _sections(document, mode, problems)
-    camera = _camera(sections["cam0"], mode) if "cam0" in sections else None
-    imu = _imu(sections["imu0"]) if "imu0" in sections else None
-    laser = _laser(sections["laser0"], camera) if "laser0" in sections else None
+    sections, camera, imu, laser = _read_sections(document, mode, problems)
+    _require(sections, mode, problems)
     if problems or camera is None:
         raise CalibrationError(source, problems)
     cam0 = sections["cam0"]

@@ -112,7 +112,7 @@ class RadtanCamera(CameraModel):
         return rays
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _undistort_radtan(distorted, k1, k2, p1, p2, k3):  # type: ignore[no-untyped-def]
     """Newton's method, point by point; in numba since every feature and every calibration of the stripe passes here."""
     rays = distorted.copy()

@@ -106,7 +106,7 @@ def interpolate(T0: FloatArray, T1: FloatArray, alpha: FloatArray | float) -> Fl
     return result
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, nogil=True)
 def _interpolate(start, end, alpha):  # type: ignore[no-untyped-def]
     """Interpolate between poses (N, 4, 4); in numba since every frame of the window passes here at every keyframe."""
     out = np.zeros((len(alpha), 4, 4))

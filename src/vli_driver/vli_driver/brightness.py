@@ -18,7 +18,7 @@ def brightness(pixels: ByteArray) -> float:
     return float(_trimmed_mean(pixels if pixels.ndim == 3 else pixels[:, :, None], STEP, _TRIM))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _trimmed_mean(pixels, step, trim):  # type: ignore[no-untyped-def]
     """Return the mean of the darkest (1 − trim) of the samples' channel means, from a histogram."""
     histogram = np.zeros(256, np.int64)

@@ -26,7 +26,7 @@ _UNEVEN = 0.15
 _TOP = 0.85
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def noise_level(profiles, channel):  # type: ignore[no-untyped-def]
     """Return the noise of one sample in grey levels: from the median difference of neighbours, which structure hardly moves."""
     histogram = np.zeros(256, np.int64)
@@ -45,7 +45,7 @@ def noise_level(profiles, channel):  # type: ignore[no-untyped-def]
     return _LEAST_NOISE
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def channel_strength(profiles, first, last):  # type: ignore[no-untyped-def]
     """Return for each channel the sum over every eighth profile of how far its brightest sample exceeds the mean."""
     strength = np.zeros(profiles.shape[2])
@@ -60,7 +60,7 @@ def channel_strength(profiles, first, last):  # type: ignore[no-untyped-def]
     return strength
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, nogil=True, fastmath=True)
 def smooth(lines, weights, out):  # type: ignore[no-untyped-def]
     """Convolve each line with a symmetric kernel; the ends are repeated.
 
@@ -89,7 +89,7 @@ def smooth(lines, weights, out):  # type: ignore[no-untyped-def]
             target[j] = np.uint16(row[j] * np.float32(SCALE) + np.float32(0.5))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _highest(line, first, last, floor):  # type: ignore[no-untyped-def]
     """Return the sample of [first, last) with the highest value above ``floor``, −1 where there is none."""
     part = line[first:last]
@@ -104,7 +104,7 @@ def _highest(line, first, last, floor):  # type: ignore[no-untyped-def]
     return -1
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _extent(line, peak, level):  # type: ignore[no-untyped-def]
     """Return where the smoothed profile falls below ``level`` left and right of ``peak``, between samples."""
     left, right, end = peak, peak, len(line) - 1
@@ -120,7 +120,7 @@ def _extent(line, peak, level):  # type: ignore[no-untyped-def]
     return low, high
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, nogil=True, fastmath=True)
 def _background(line):  # type: ignore[no-untyped-def]
     """Return the mean of every eighth sample not above the mean of all of them: the stripe and bright patches are out."""
     total, count = 0.0, 0
@@ -136,7 +136,7 @@ def _background(line):  # type: ignore[no-untyped-def]
     return low / number if number else mean
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _ground(line, peak, background):  # type: ignore[no-untyped-def]
     """Return the level of the bright surface that a peak stands on, found beside its top."""
     low, high = _extent(line, peak, background + _TOP * (line[peak] - background))
@@ -144,7 +144,7 @@ def _ground(line, peak, background):  # type: ignore[no-untyped-def]
     return max(line[max(int(low) - apart, 0)], line[min(int(high) + apart, len(line) - 1)], background)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def find_peaks(smoothed, first, last, threshold, ambiguity, max_width):  # type: ignore[no-untyped-def]
     """Find the highest peak of each smoothed profile, and a second one apart from it.
 
@@ -184,7 +184,7 @@ def find_peaks(smoothed, first, last, threshold, ambiguity, max_width):  # type:
     return found
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _second(line, begin, end, low, high, floor):  # type: ignore[no-untyped-def]
     """Return the highest local maximum outside the peak [low, high]; the flank of that peak is none."""
     below = _highest(line, begin, max(int(low) - 1, begin), floor)
@@ -195,7 +195,7 @@ def _second(line, begin, end, low, high, floor):  # type: ignore[no-untyped-def]
     return peak
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _mean(profiles, i, channel, first, last):  # type: ignore[no-untyped-def]
     """Return the mean of the samples [first, last) that exist, NaN where none does."""
     total, count = 0.0, 0
@@ -205,7 +205,7 @@ def _mean(profiles, i, channel, first, last):  # type: ignore[no-untyped-def]
     return total / count if count else np.nan
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _moments(profiles, i, channel, low, high, left, right):  # type: ignore[no-untyped-def]
     """Return Σ I, Σ I x of the window [low, high] above a background from left to right; samples that it cuts count in part."""
     total, weighted = 0.0, 0.0
@@ -217,7 +217,7 @@ def _moments(profiles, i, channel, low, high, left, right):  # type: ignore[no-u
     return total, weighted
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _sides(profiles, i, channel, centre, reach):  # type: ignore[no-untyped-def]
     """Return the mean grey level just outside ``centre`` ± ``reach``, below and above."""
     low, high = int(np.floor(centre - reach + 0.5)), int(np.floor(centre + reach + 0.5))
@@ -226,7 +226,7 @@ def _sides(profiles, i, channel, centre, reach):  # type: ignore[no-untyped-def]
     return (right if np.isnan(left) else left), (left if np.isnan(right) else right)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _spread(profiles, i, channel, centre, half, background, noise):  # type: ignore[no-untyped-def]
     """Return Σ k² var(I_k) of sensor noise, Σ k² I_k² for speckle, and the highest I, in the window about ``centre``."""
     sensor, speckle, top = 0.0, 0.0, 0.0
@@ -238,7 +238,7 @@ def _spread(profiles, i, channel, centre, half, background, noise):  # type: ign
     return sensor, speckle, top
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _other_channels(profiles, i, channel, centre, half, reach):  # type: ignore[no-untyped-def]
     """Return Σ I of the mean of the other channels in the same window, zero where there are none."""
     total = 0.0
@@ -249,7 +249,7 @@ def _other_channels(profiles, i, channel, centre, half, reach):  # type: ignore[
     return max(total, 0.0) / max(profiles.shape[2] - 1, 1)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def locate(profiles, channel, peaks, smoothing, noise, threshold, window_sigmas, max_width):  # type: ignore[no-untyped-def]
     """Return the centre of mass of each peak above its local background.
 

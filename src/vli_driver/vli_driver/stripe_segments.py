@@ -15,7 +15,7 @@ _MAX_MISSING = 2
 """Missing points that do not end a segment."""
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _median(values, count):  # type: ignore[no-untyped-def]
     """Return the median of the first ``count`` values (insertion sort in place: they are few)."""
     for i in range(1, count):
@@ -28,7 +28,7 @@ def _median(values, count):  # type: ignore[no-untyped-def]
     return values[count // 2]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def choose_chain(found, max_jump):  # type: ignore[no-untyped-def]
     """Choose one peak per profile so that the line jumps least, the brighter one where that does not decide (Viterbi).
 
@@ -65,7 +65,7 @@ def choose_chain(found, max_jump):  # type: ignore[no-untyped-def]
     return chosen, ambiguous
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _segment_end(located, keep, start, max_jump):  # type: ignore[no-untyped-def]
     """Return the last profile of the segment that starts at ``start``."""
     last = start
@@ -79,7 +79,7 @@ def _segment_end(located, keep, start, max_jump):  # type: ignore[no-untyped-def
     return last
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def keep_segments(located, ambiguous, max_jump, min_points, min_colour_ratio):  # type: ignore[no-untyped-def]
     """Return (N,) bool: the profiles whose point lies on a segment that is long, unambiguous and coloured enough."""
     keep = ~np.isnan(located[:, 0])
@@ -102,7 +102,7 @@ def keep_segments(located, ambiguous, max_jump, min_points, min_colour_ratio):  
     return keep
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def trim_segments(located, keep, max_jump, trim, min_points):  # type: ignore[no-untyped-def]
     """Clear the first and last ``trim`` points of every segment, where an edge cuts the line, and segments too short by now."""
     i = 0
@@ -120,7 +120,7 @@ def trim_segments(located, keep, max_jump, trim, min_points):  # type: ignore[no
         i = last + 1
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def steady_lean(located, keep):  # type: ignore[no-untyped-def]
     """Return (N,) the median lean of each kept point and its neighbours: speckle averages out, a line that an edge cuts leans on.
 

@@ -129,7 +129,7 @@ def _laser(calibration: Calibration) -> LaserCalibration:
     return calibration.laser
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _triangulate(pixels, sigma_px, rays, plane, limits, along, points, sigma, valid):  # type: ignore[no-untyped-def]
     height, width = rays.shape[:2]
     for i in range(len(pixels)):

@@ -52,7 +52,7 @@ def _peaks(response: Float32Array, threshold: float) -> IntArray:
     return np.stack([rows[order], columns[order]], axis=1).astype(np.int64)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _choose(response: Float32Array, peaks: IntArray, existing: FloatArray, count: int, distance: float, cells: int) -> FloatArray:
     """Return up to ``count`` points (M, 2), x and y; rounds over the grid raise the number of points a cell may hold by one."""
     height, width = response.shape
@@ -80,12 +80,12 @@ def _choose(response: Float32Array, peaks: IntArray, existing: FloatArray, count
     return points[len(existing) : used]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _cell(coordinate: float, size: float, cells: int) -> int:
     return min(max(int(coordinate / size), 0), cells - 1)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _is_clear(points: FloatArray, x: float, y: float, distance: float) -> bool:
     nearest = np.inf
     for n in range(len(points)):

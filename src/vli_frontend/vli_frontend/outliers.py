@@ -56,7 +56,7 @@ def _essential_inliers(previous: FloatArray, current: FloatArray, threshold: flo
     return np.ones(len(previous), np.bool_) if mask is None else mask.ravel().astype(np.bool_)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def translation_inliers(
     previous: FloatArray, current: FloatArray, rotation: FloatArray, pairs: IntArray, threshold: float
 ) -> BoolArray:
@@ -93,17 +93,17 @@ def translation_inliers(
     return inliers
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _epipolar_normal(turned: FloatArray, current: FloatArray, n: int) -> FloatArray:
     return _cross(turned[n], np.array([current[n, 0], current[n, 1], 1.0]))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _line_distance(turned: FloatArray, current: FloatArray, direction: FloatArray) -> float:
     """Return the distance of a ray from the epipolar line of its (rotated) partner, normalised image plane."""
     a = direction[1] * turned[2] - direction[2] * turned[1]

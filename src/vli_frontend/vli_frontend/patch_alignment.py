@@ -104,7 +104,7 @@ class PatchTemplates:
         return result
 
 
-@njit(cache=True, fastmath=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _sample(grey: ByteArray, x: float, y: float, warp: FloatArray, out: Float32Array) -> None:
     """Write the bilinear values (_PIXELS,) of the image under the warp; beyond the border its edge is repeated."""
     height, width = grey.shape
@@ -124,7 +124,7 @@ def _sample(grey: ByteArray, x: float, y: float, warp: FloatArray, out: Float32A
         out[k] = top + fy * (bottom - top)
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, nogil=True, fastmath=True)
 def _sample_square(grey: ByteArray, x: float, y: float, out: Float32Array) -> None:
     """Write the bilinear values of an upright square centred on a point, all inside the image."""
     size = len(out)
@@ -139,7 +139,7 @@ def _sample_square(grey: ByteArray, x: float, y: float, out: Float32Array) -> No
             out[j, i] = (one - fy) * top + fy * bottom
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, nogil=True, fastmath=True)
 def _fill_rows(square: Float32Array, patch: Float32Array, rows: Float32Array) -> None:
     """Write the patch (_PIXELS,) and the rows (_UNKNOWNS, _PIXELS) of the linear model from its square with a rim of one."""
     half, total = np.float32(0.5), np.float32(0.0)
@@ -157,7 +157,7 @@ def _fill_rows(square: Float32Array, patch: Float32Array, rows: Float32Array) ->
         rows[8, k], rows[9, k] = _U[k] * patch[k], _V[k] * patch[k]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _invert(matrix: FloatArray) -> bool:
     """Invert a symmetric positive definite matrix in place (Gauss–Jordan); False where it is not one, to rounding."""
     n = len(matrix)
@@ -188,7 +188,7 @@ def _invert(matrix: FloatArray) -> bool:
     return True
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, nogil=True, fastmath=True)
 def _create(
     grey: ByteArray,
     slots: IntArray,
@@ -218,7 +218,7 @@ def _create(
             sigma[slot] = math.sqrt(0.5 * ((solvers[slot, :2] ** 2).sum()))
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, nogil=True, fastmath=True)
 def _fill_solver(rows: Float32Array, inverse: FloatArray, solver: Float32Array) -> None:
     """Write (JᵀWJ)⁻¹ JᵀW, (_UNKNOWNS, _PIXELS)."""
     for i in range(_UNKNOWNS):
@@ -231,7 +231,7 @@ def _fill_solver(rows: Float32Array, inverse: FloatArray, solver: Float32Array) 
             solver[i, k] *= _WEIGHT[k]
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, nogil=True, fastmath=True)
 def _solve(solver: Float32Array, values: Float32Array, unknowns: FloatArray) -> None:
     for i in range(_UNKNOWNS):
         total = np.float32(0.0)
@@ -240,7 +240,7 @@ def _solve(solver: Float32Array, values: Float32Array, unknowns: FloatArray) -> 
         unknowns[i] = total
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _compose(pixel: FloatArray, warp: FloatArray, unknowns: FloatArray) -> float:
     """Compose the warp with the inverse of the increment, W ← W ∘ Δ⁻¹; return the step of the centre in pixels."""
     gain = unknowns[6]
@@ -257,7 +257,7 @@ def _compose(pixel: FloatArray, warp: FloatArray, unknowns: FloatArray) -> float
     return math.hypot(tx, ty)
 
 
-@njit(cache=True, fastmath=True)
+@njit(cache=True, nogil=True, fastmath=True)
 def _agreement(patch: Float32Array, values: Float32Array, unknowns: FloatArray) -> tuple[float, float]:
     """Return the weighted correlation of the values with the patch under the fitted light, and the RMS of what differs."""
     mean = 0.0
@@ -281,7 +281,7 @@ def _agreement(patch: Float32Array, values: Float32Array, unknowns: FloatArray) 
     return correlation, math.sqrt(variance * max(0.0, 1.0 - correlation * correlation))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _align(
     grey: ByteArray,
     slots: IntArray,

@@ -57,7 +57,7 @@ def normalise_locally(grey: ByteArray, window_px: int) -> ByteArray:
     return out
 
 
-@njit(cache=True, fastmath=True, error_model="numpy")
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def _standardise(grey: ByteArray, mean: Float32Array, square: Float32Array, out: ByteArray) -> None:
     height, width = grey.shape
     for y in range(height):

@@ -42,7 +42,7 @@ class StripeDistance:
         return result
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _lower_to_nearest(pixels: FloatArray, stripe: FloatArray, distance: FloatArray) -> None:
     for n in range(len(pixels)):
         best = distance[n] * distance[n]

@@ -116,7 +116,7 @@ def _search(point_map: PointMap, queries: _Queries, config: AssociationConfig) -
     return planes, outcome
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _search_planes(  # type: ignore[no-untyped-def]
     grid, columns, queries, newest_scan, newest_ns, limits, min_neighbours, planes, outcome
 ):
@@ -162,14 +162,14 @@ def _search_planes(  # type: ignore[no-untyped-def]
         planes[index, 7] = (fit[6] - min_planarity) / (1 - min_planarity) * min(1.0, old / _FULL_SUPPORT)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _turn(plane, normal):  # type: ignore[no-untyped-def]
     """Turn the normal of a fitted plane to the side of the map point's, so that the far side of a thin wall does not agree."""
     if plane[3] * normal[0] + plane[4] * normal[1] + plane[5] * normal[2] < 0:
         plane[3:6] *= -1.0
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _nearest_old(  # type: ignore[no-untyped-def]
     heads, following, cell_m, position, scan, entered_ns, solid, p, newest_scan, newest_ns, gate
 ):

@@ -29,7 +29,7 @@ def colour_points(camera: CameraModel, points: FloatArray, views: Sequence[tuple
     return result
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _add_samples(pixels, where, total, count):  # type: ignore[no-untyped-def]
     """Add bilinear samples of BGR or grey (H, W, C) at pixels (N, 2) to RGB sums (N, 3); skip what lies outside."""
     height, width, channels = pixels.shape

@@ -55,7 +55,7 @@ def noisy(points: FloatArray, sigma: FloatArray, max_ratio: float) -> BoolArray:
     return result
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _trim_edges(points, sigma, edge_jump, slope, trim, min_segment, keep):  # type: ignore[no-untyped-def]
     """Cut the stripe where the range jumps; drop short pieces whole and ``trim`` points at the cut ends of the others."""
     count = len(points)
@@ -73,7 +73,7 @@ def _trim_edges(points, sigma, edge_jump, slope, trim, min_segment, keep):  # ty
         start = stop
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _jumps(a, b, sigma, edge_jump, slope):  # type: ignore[no-untyped-def]
     """Return True where the step from a to b is farther along the ray than a surface at the largest incidence would go."""
     length = np.sqrt(a[0] ** 2 + a[1] ** 2 + a[2] ** 2)
@@ -83,7 +83,7 @@ def _jumps(a, b, sigma, edge_jump, slope):  # type: ignore[no-untyped-def]
     return across > edge_jump or abs(along) > slope * across + _NOISE_SIGMAS * sigma
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _mark_supported(heads, following, beside, cell_m, points, radius, result):  # type: ignore[no-untyped-def]
     for index in range(len(points)):
         result[index] = any_near(heads, following, beside, points[index], radius, cell_m)

@@ -11,7 +11,7 @@ ROWS, FREE_HEAD, FREE = 0, 1, 2
 """Of the state (3,): rows in use, first of the chain of free rows among them (−1: none), and how many these are."""
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def insert_stripe(heads, following, cell_m, state, columns, stripe, number, stamp_ns, limits, target):  # type: ignore[no-untyped-def]
     """Merge or add every point of a stripe, solid ones first; write its row, or −1, into ``target`` (N,).
 
@@ -45,7 +45,7 @@ def insert_stripe(heads, following, cell_m, state, columns, stripe, number, stam
             target[index] = at
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _add(heads, following, cell_m, state, columns, stripe, index, number, stamp_ns):  # type: ignore[no-untyped-def]
     """Write a point into a row that is free, else into a new one; return the row."""
     position, normal, colour, weight, sigma, planarity, scan, entered_ns, solid = columns
@@ -70,7 +70,7 @@ def _add(heads, following, cell_m, state, columns, stripe, index, number, stamp_
     return at
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _covered(heads, following, cell_m, position, solid, p, radius):  # type: ignore[no-untyped-def]
     """Return True where a solid point lies within ``radius`` of ``p``."""
     for i in range(cell_of(p[0] - radius, cell_m), cell_of(p[0] + radius, cell_m) + 1):
@@ -84,7 +84,7 @@ def _covered(heads, following, cell_m, position, solid, p, radius):  # type: ign
     return False
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _drop_doubtful(heads, following, cell_m, state, columns, p, radius):  # type: ignore[no-untyped-def]
     """Let the doubtful points within ``radius`` of ``p`` leave: their rows are free."""
     position, weight, solid = columns[0], columns[3], columns[8]
@@ -103,13 +103,13 @@ def _drop_doubtful(heads, following, cell_m, state, columns, p, radius):  # type
                     at = after
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def squared_distance(a, b):  # type: ignore[no-untyped-def]
     """Return |a − b|² of two points (3,)."""
     return (a[0] - b[0]) ** 2 + (a[1] - b[1]) ** 2 + (a[2] - b[2]) ** 2
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _nearest_compatible(heads, following, cell_m, columns, p, stripe, index, radius, limits):  # type: ignore[no-untyped-def]
     """Return the row of the nearest point, as solid as the stripe's, that agrees in normal and colour; −1 where there is none."""
     position, normal, colour, solid = columns[0], columns[1], columns[2], columns[8]
@@ -134,7 +134,7 @@ def _nearest_compatible(heads, following, cell_m, columns, p, stripe, index, rad
     return best
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def normals_agree(a, b, min_cosine):  # type: ignore[no-untyped-def]
     """Return True where two normals (3,) are within the angle, or one is unknown (0)."""
     if (a[0] == 0 and a[1] == 0 and a[2] == 0) or (b[0] == 0 and b[1] == 0 and b[2] == 0):
@@ -142,14 +142,14 @@ def normals_agree(a, b, min_cosine):  # type: ignore[no-untyped-def]
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2] >= min_cosine
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def colours_agree(a, b, limit):  # type: ignore[no-untyped-def]
     """Return True where two colours (3,) differ by at most ``limit`` in every channel, or one is unknown (NaN)."""
     # Written so that NaN passes.
     return not (abs(a[0] - b[0]) > limit or abs(a[1] - b[1]) > limit or abs(a[2] - b[2]) > limit)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _merge(heads, following, cell_m, at, columns, stripe, index, max_weight):  # type: ignore[no-untyped-def]
     """Average point ``index`` of a stripe into row ``at``."""
     position, normal, colour, weight, sigma = columns[:5]
@@ -182,7 +182,7 @@ def _merge(heads, following, cell_m, at, columns, stripe, index, max_weight):  #
     sigma[at] = 1.0 / np.sqrt(information)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _blend_normal(normal, n, share):  # type: ignore[no-untyped-def]
     """Turn a normal (3,), in place, towards ``n`` by ``share``; an unknown one takes the other."""
     if n[0] == 0 and n[1] == 0 and n[2] == 0:

@@ -58,7 +58,7 @@ def refine_normals(
     )
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _fit_normals(  # type: ignore[no-untyped-def]
     heads, following, positions, cell_m, points, which, viewpoint, radius, min_planarity, normals, planarity
 ):
@@ -81,7 +81,7 @@ def _fit_normals(  # type: ignore[no-untyped-def]
             normals[index, axis] = sign * plane[3 + axis] if good else 0.0
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def fit_plane(positions, which, origin, plane):  # type: ignore[no-untyped-def]
     """Fit a plane to points ``which`` (K,) of ``positions``; sums are taken about ``origin`` (3,).
 
@@ -118,7 +118,7 @@ def fit_plane(positions, which, origin, plane):  # type: ignore[no-untyped-def]
     plane[7] = np.sqrt(smallest)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def smallest_eigenvector(xx, xy, xz, yy, yz, zz, vector):  # type: ignore[no-untyped-def]
     """Write the eigenvector of the smallest eigenvalue of a symmetric positive semi-definite 3×3; return all three, ascending.
 

@@ -268,7 +268,7 @@ def _text(image: ByteArray, text: str, at: tuple[int, int], size: float, colour:
     cv2.putText(image, text, at, cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _front(local, radius, depth):  # type: ignore[no-untyped-def]
     """Write the nearest depth at each pixel of discs at local (N, 3): in pixels from the middle, z to the viewer."""
     height, width = depth.shape
@@ -283,7 +283,7 @@ def _front(local, radius, depth):  # type: ignore[no-untyped-def]
                     depth[v, u] = z
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _blend(local, radius, thickness, depth, colours, blend):  # type: ignore[no-untyped-def]
     """Add colour, depth and weight (H, W, 5) of the discs within ``thickness`` of the front, heavier towards their middle."""
     height, width = depth.shape

@@ -59,13 +59,13 @@ def _buckets_for(capacity: int) -> int:
     return max(_MIN_BUCKETS, 1 << (2 * capacity - 1).bit_length())
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def cell_of(coordinate, cell_m):  # type: ignore[no-untyped-def]
     """Return the index of the cell along one axis."""
     return np.int64(np.floor(coordinate / cell_m))
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def bucket_of(i, j, k, buckets):  # type: ignore[no-untyped-def]
     """Return the bucket of cell (i, j, k) in a table of ``buckets`` (a power of two)."""
     block = (i >> 2) * np.int64(73856093) ^ (j >> 2) * np.int64(19349663) ^ (k >> 2) * np.int64(83492791)
@@ -73,7 +73,7 @@ def bucket_of(i, j, k, buckets):  # type: ignore[no-untyped-def]
     return ((block << 6) | ((i & 3) << 4) | ((j & 3) << 2) | (k & 3)) & (buckets - 1)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def link_one(heads, following, index, position, cell_m):  # type: ignore[no-untyped-def]
     """Put one point at the head of its chain."""
     bucket = bucket_of(cell_of(position[0], cell_m), cell_of(position[1], cell_m), cell_of(position[2], cell_m), len(heads))
@@ -81,7 +81,7 @@ def link_one(heads, following, index, position, cell_m):  # type: ignore[no-unty
     heads[bucket] = index
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def unlink_one(heads, following, index, position, cell_m):  # type: ignore[no-untyped-def]
     """Take one point, linked at ``position``, out of its chain."""
     bucket = bucket_of(cell_of(position[0], cell_m), cell_of(position[1], cell_m), cell_of(position[2], cell_m), len(heads))
@@ -96,27 +96,27 @@ def unlink_one(heads, following, index, position, cell_m):  # type: ignore[no-un
         at = following[at]
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def link(heads, following, positions, start, stop, cell_m):  # type: ignore[no-untyped-def]
     """Link points [start, stop) of ``positions``."""
     for index in range(start, stop):
         link_one(heads, following, index, positions[index], cell_m)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _link_again(heads, following, positions, linked, cell_m):  # type: ignore[no-untyped-def]
     for index in range(len(linked)):
         if linked[index]:
             link_one(heads, following, index, positions[index], cell_m)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def same_cell(position, i, j, k, cell_m):  # type: ignore[no-untyped-def]
     """Return True where ``position`` lies in cell (i, j, k)."""
     return cell_of(position[0], cell_m) == i and cell_of(position[1], cell_m) == j and cell_of(position[2], cell_m) == k
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def neighbours(heads, following, positions, centre, radius, cell_m, found):  # type: ignore[no-untyped-def]
     """Write the indices of the points within ``radius`` of ``centre`` into ``found``; return how many (at most its length)."""
     count = 0
@@ -135,7 +135,7 @@ def neighbours(heads, following, positions, centre, radius, cell_m, found):  # t
     return count
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def any_near(heads, following, positions, centre, radius, cell_m):  # type: ignore[no-untyped-def]
     """Return True where a point lies within ``radius`` of ``centre``."""
     squared = radius * radius

@@ -33,7 +33,7 @@ def _heaviest(points: FloatArray, weights: Float32Array, edge: float) -> IntArra
     return np.flatnonzero(kept)
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def _mark_heaviest(heads, following, points, weights, edge, kept):  # type: ignore[no-untyped-def]
     """Chain one point a voxel, the heaviest so far."""
     for index in range(len(points)):
