@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import itertools
 from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -11,6 +12,7 @@ from typing import Any
 
 import yaml
 
+from vli_common.arrays import FloatArray, IntArray
 from vli_common.errors import InputError, MessageError
 from vli_common.types import NANOSECONDS, Counters, EncodedImage, ImuSample
 from vli_driver import cdr
@@ -35,6 +37,7 @@ class BagTopics:
         imu: Imu.
         camera_info, exposure: optional in the bag.
         imu_required: False lets a bag without an IMU pass (mode ``vl``).
+        image_required: False lets a bag without images pass (an IMU at rest).
     """
 
     image: str = DEFAULT_IMAGE_TOPIC
@@ -42,6 +45,7 @@ class BagTopics:
     camera_info: str = "/camera/camera_info"
     exposure: str = "/camera/exposure"
     imu_required: bool = True
+    image_required: bool = True
 
 
 class BagReader:
@@ -72,7 +76,7 @@ class BagReader:
         self._start_ns = round(start_s * NANOSECONDS)
         self._duration_ns = None if duration_s is None else round(duration_s * NANOSECONDS)
         chosen = topics or BagTopics()
-        self.image_topic = self._choose_image(chosen.image)
+        self.image_topic = self._choose_image(chosen.image) if chosen.image_required else ""
         self.imu_topic = self._choose_imu(chosen)
         self.camera_info_topic = chosen.camera_info if chosen.camera_info in self.topics else None
         self.exposure_topic = chosen.exposure if chosen.exposure in self.topics else None
@@ -111,6 +115,27 @@ class BagReader:
         if joiner is not None:
             yield from joiner.flush()
         self._collect_warnings()
+
+    def imu_blocks(self, size: int = 10_000) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
+        """Yield all IMU samples in blocks: stamps (N,) ns, rates (N, 3), specific forces (N, 3); for recordings of hours.
+
+        A malformed message is dropped and counted, as in iterating.
+        """
+        raw = (message.data for message in self._raw({self.imu_topic or ""}))
+        while block := list(itertools.islice(raw, size)):
+            try:
+                yield cdr.read_imus(block)
+            except MessageError:
+                yield cdr.read_imus([data for data in block if self._is_imu(data)])
+        self._collect_warnings()
+
+    def _is_imu(self, data: bytes) -> bool:
+        try:
+            cdr.read_imu(data)
+        except MessageError:
+            self.counters.add("malformed")
+            return False
+        return True
 
     def _selected(self) -> Iterator[RawMessage]:
         """Yield the messages within start and duration, by header stamp."""
