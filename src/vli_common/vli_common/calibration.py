@@ -123,20 +123,32 @@ def check_document(document: dict[str, Any], source: str) -> None:
         CalibrationError: naming every problem.
     """
     problems: list[str] = []
-    _read_sections(document, None, problems)
+    sections = _sections(document, [], "", problems)
+    camera = _camera(sections["cam0"]) if "cam0" in sections else None
+    if "imu0" in sections:
+        _imu(sections["imu0"])
+    if "laser0" in sections:
+        _laser(sections["laser0"], camera)
     if problems:
         raise CalibrationError(source, problems)
 
 
-def parse_calibration(text: str, mode: Mode | None = Mode.VLI_SLAM, source: str = "topic", imu_text: str | None = None) -> Calibration:
+def parse_calibration(
+    text: str, mode: Mode | None = Mode.VLI_SLAM, source: str = "topic", imu_text: str | None = None
+) -> Calibration:
     """Like :func:`load_calibration`, from the text of the file."""
     document = _parse_yaml(text, source)
     if imu_text is not None:
         imu_document = _parse_yaml(imu_text, f"{source} (IMU file)")
         document["imu0"] = imu_document.get("imu0", imu_document)
     problems: list[str] = []
-    sections, camera, imu, laser = _read_sections(document, mode, problems)
-    _require(sections, mode, problems)
+    needed_by = f", mode '{mode.value}' needs it" if mode else ""
+    sections = _sections(document, _needed(mode), needed_by, problems)
+    camera = _camera(sections["cam0"]) if "cam0" in sections else None
+    imu = _imu(sections["imu0"]) if "imu0" in sections else None
+    laser = _laser(sections["laser0"], camera) if "laser0" in sections else None
+    if mode and mode.uses_imu and "cam0" in sections:
+        sections["cam0"].missing("T_cam_imu", f"mode '{mode.value}' needs it; make it with 'vli calibrate imu-camera'")
     if problems or camera is None:
         raise CalibrationError(source, problems)
     cam0 = sections["cam0"]
@@ -297,17 +309,18 @@ def _parse_yaml(text: str, source: str) -> dict[str, Any]:
     return document
 
 
-def _sections(document: dict[str, Any], mode: Mode, problems: list[str]) -> dict[str, _Section]:
-    """Return the sections that are there, having checked names, keys, and that all the mode needs is present."""
+def _needed(mode: Mode | None) -> list[str]:
+    return ["cam0"] + (["imu0"] * mode.uses_imu + ["laser0"] * mode.uses_laser if mode else [])
+
+
+def _sections(document: dict[str, Any], needed: list[str], needed_by: str, problems: list[str]) -> dict[str, _Section]:
+    """Return the sections that are there, having checked names, keys, and that all that is needed is present."""
     cameras = sorted(name for name in document if isinstance(name, str) and name.startswith("cam") and name[3:].isdigit())
     if len(cameras) > 1:
         problems.append(f"two cameras ('{', '.join(cameras)}'), expected one; keep the scanner's camera as 'cam0'")
     problems += [_unknown(str(name), _KEYS, "section") for name in document if name not in _KEYS and name not in cameras[1:]]
-    needed = ["cam0"] + ["imu0"] * mode.uses_imu + ["laser0"] * mode.uses_laser
     problems += [
-        f"section '{name}' is missing, mode '{mode.value}' needs it; {_SECTION_HINTS[name]}"
-        for name in needed
-        if document.get(name) is None
+        f"section '{name}' is missing{needed_by}; {_SECTION_HINTS[name]}" for name in needed if document.get(name) is None
     ]
     sections = {}
     for name, keys in _KEYS.items():
@@ -322,7 +335,7 @@ def _sections(document: dict[str, Any], mode: Mode, problems: list[str]) -> dict
     return sections
 
 
-def _camera(section: _Section, mode: Mode) -> CameraModel | None:
+def _camera(section: _Section) -> CameraModel | None:
     section.choice("camera_model", ("pinhole",))
     model = section.choice("distortion_model", MODELS)
     intrinsics = section.numbers("intrinsics", (4,))
@@ -331,8 +344,6 @@ def _camera(section: _Section, mode: Mode) -> CameraModel | None:
     section.number("rate_hz", DEFAULT_RATE_HZ, positive=True)
     section.number("timeshift_cam_imu", 0.0)
     section.transform("T_cam_imu")
-    if mode.uses_imu:
-        section.missing("T_cam_imu", f"mode '{mode.value}' needs it; make it with 'vli calibrate imu-camera'")
     if model is None or intrinsics is None or resolution is None or coefficients is None:
         return None
     if not _plausible_pinhole(section, intrinsics, resolution):
