@@ -62,6 +62,12 @@ class BackEndConfig:
         doc="factor on the sigma of eq. (4): its points are correlated (1/5.8² = 0.03 of their information)",
     )
     map_cauchy: float = parameter(2.0, unit="sigma", minimum=0.1, maximum=100.0, doc="robust loss of eq. (4)")
+    covariance_scale: float = parameter(
+        0.5,
+        minimum=0.01,
+        maximum=100.0,
+        doc="factor on the variances that are published: the residuals' sigmas are wide on purpose",
+    )
     tilt_sigma: float = parameter(
         1.0e-4,
         unit="rad",

@@ -14,6 +14,7 @@ from vli_backend.frame_pose import FramePose, solve_frame_pose
 from vli_backend.landmarks import LandmarkTable
 from vli_backend.laser_depth import measure_slot
 from vli_backend.map_residuals import condense_map
+from vli_backend.pose_covariance import PoseCovariance
 from vli_backend.prediction import Prediction, Predictor
 from vli_backend.smoother import Condenser, GtsamSmoother, KeyframeState, Smoother, SmootherError, StatePrior
 from vli_backend.window import FrameRecord, Window, close_interval
@@ -86,6 +87,8 @@ class WindowEstimator:
         self._records = [FrameRecord(first.stamp_ns, state.T_map_imu @ self._T_imu_cam, first.stationary)]
         self._predictor = Predictor(self._T_imu_cam)
         self._predictor.set_keyframe(first.stamp_ns, state)
+        self._covariance = PoseCovariance(self._T_imu_cam, config.covariance_scale)
+        self._covariance.set_keyframe(state.T_map_imu, self._smoother.newest_covariance())
         self._measure_depths()
         self._points = self._landmarks.points(self._keyframe_poses())
 
@@ -109,8 +112,9 @@ class WindowEstimator:
             last = self._records[-1]
             self._records.append(FrameRecord(stamp_ns, last.T_map_camera, last.stationary))
             self._predictor.observe(stamp_ns, last.T_map_camera)
-        covariance = np.diag([1e-8] * 6)
-        pose = self._estimate(stamp_ns, self._records[-1].T_map_camera, self._state.velocity, covariance, session)
+        pose = self._estimate(
+            stamp_ns, self._records[-1].T_map_camera, self._state.velocity, self._covariance.of_keyframe(), session
+        )
         return FrameResult(
             pose, len(self._points.ids), self._window.poses(self._keyframe_poses(), 0, session), self._bias(session)
         )
@@ -125,7 +129,8 @@ class WindowEstimator:
         self._records.append(FrameRecord(tracks.stamp_ns, found.T_map_camera, tracks.stationary))
         if tracks.keyframe:
             return self._add_keyframe(tracks, imu, found, predicted.velocity, session)
-        pose = self._estimate(tracks.stamp_ns, found.T_map_camera, predicted.velocity, self._covariance(found), session)
+        covariance = self._covariance.of_frame(found.T_map_camera @ self._T_cam_imu, found.information)
+        pose = self._estimate(tracks.stamp_ns, found.T_map_camera, predicted.velocity, covariance, session)
         return FrameResult(pose, found.inliers)
 
     def add_start_keyframe(
@@ -143,6 +148,7 @@ class WindowEstimator:
             FrameRecord(self._window.stamps[-1], self._state.T_map_imu @ self._T_imu_cam, self._window.stationary[-1])
         ]
         self._predictor.set_keyframe(self._window.stamps[-1], self._state)
+        self._covariance.set_keyframe(self._state.T_map_imu, self._smoother.newest_covariance())
 
     def flush(self, session: int) -> WindowPoses | None:
         """Return all frames as final, those after the newest keyframe included."""
@@ -209,10 +215,11 @@ class WindowEstimator:
         T = self._state.T_map_imu
         self._records = [FrameRecord(tracks.stamp_ns, T @ self._T_imu_cam, tracks.stationary)]
         self._T_map_odom = T @ inverse(T_odom_imu)
-        pose = self._estimate(
-            tracks.stamp_ns, self._records[0].T_map_camera, self._state.velocity, self._covariance(found), session
-        )
         window = self._leave(session)
+        self._covariance.set_keyframe(T, self._smoother.newest_covariance())
+        pose = self._estimate(
+            tracks.stamp_ns, self._records[0].T_map_camera, self._state.velocity, self._covariance.of_keyframe(), session
+        )
         return FrameResult(pose, found.inliers, window, self._bias(session))
 
     def _append_keyframe(self, tracks: Tracks, state: KeyframeState, imu: gtsam.PreintegratedCombinedMeasurements | None) -> None:
@@ -310,16 +317,6 @@ class WindowEstimator:
     def _keyframe_poses(self) -> FloatArray:
         """Return ``T_map_camera`` (K, 4, 4) of the window."""
         result: FloatArray = np.stack([state.T_map_imu for state in self._smoother.states()]) @ self._T_imu_cam
-        return result
-
-    def _covariance(self, found: FramePose) -> FloatArray:
-        """Return the (6, 6) covariance in ROS order from that of the frame in the camera."""
-        camera = np.linalg.inv(found.information)
-        rotation = found.T_map_camera[:3, :3]
-        turn = np.zeros((6, 6))
-        turn[:3, 3:] = rotation
-        turn[3:, :3] = rotation
-        result: FloatArray = turn @ camera @ turn.T
         return result
 
     def _bias(self, session: int) -> ImuBias:

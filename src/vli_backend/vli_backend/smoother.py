@@ -181,11 +181,22 @@ class GtsamSmoother:
 
     def newest_covariance(self) -> FloatArray:
         """See :meth:`Smoother.newest_covariance`."""
+        order = gtsam.Ordering()
+        keyframes = range(self._first, self._first + self._count)
+        for k in keyframes:
+            order.push_back(V(k))
+            order.push_back(B(k))
+            if k < keyframes[-1]:
+                order.push_back(X(k))
+        # Eliminated last, the pose is conditioned on nothing: its block of the square-root information is its marginal.
+        order.push_back(X(keyframes[-1]))
         try:
-            marginals = gtsam.Marginals(self._smoother.getFactors(), self._smoother.getLinearizationPoint())
-            return np.asarray(marginals.marginalCovariance(X(self._first + self._count - 1)))
+            graph = self._smoother.getFactors().linearize(self._smoother.getLinearizationPoint())
+            factors = graph.eliminateSequential(order)
+            root = factors.at(factors.size() - 1).R()
         except RuntimeError as error:
             raise SmootherError(f"no covariance: {_first_line(error)}") from error
+        return np.asarray(np.linalg.inv(root.T @ root))
 
     def _poses(self) -> FloatArray:
         return np.stack([self._estimate.atPose3(X(k)).matrix() for k in range(self._first, self._first + self._count)])
