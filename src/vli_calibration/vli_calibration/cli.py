@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 import importlib
 
-COMMANDS: dict[str, tuple[str, str]] = {}
+COMMANDS: dict[str, tuple[str, str]] = {
+    "imu": ("imu", "noise densities and random walks of an IMU from hours at rest"),
+}
 """Name → module in :mod:`vli_calibration.commands` with ``add_arguments(parser)`` and ``run(args) -> int``, and its help."""
 
 
