@@ -74,8 +74,8 @@ def measure_imu_noise(recording: ImuRecording) -> ImuNoise:
     """
     stretch = longest_still_stretch(recording, SHORTEST_S)
     means, block_s = stretch.block_means()
-    sensors = [_measure(means[:, part], block_s, stretch, part) for part in (slice(0, 3), slice(3, 6))]
-    return ImuNoise(*sensors, recording.rate_hz, stretch)
+    gyro, accel = (_measure(means[:, part], block_s, stretch, part) for part in (slice(0, 3), slice(3, 6)))
+    return ImuNoise(gyro, accel, recording.rate_hz, stretch)
 
 
 def allan_deviation(values: FloatArray, period_s: float) -> tuple[FloatArray, FloatArray]:

@@ -93,10 +93,10 @@ def fit_noise(means: FloatArray, block_s: float) -> NoiseFit:
     with_flicker = spectrum.maximise([WHITE, FLICKER, WALK])
     if 2 * (spectrum.cost(theta) - spectrum.cost(with_flicker)) > _SIGNIFICANT:
         active, theta = [WHITE, FLICKER, WALK], with_flicker
-    intervals = [spectrum.interval(theta, active, index) if index in active else (0.0, 0.0) for index in range(3)]
-    deviations = np.sqrt(theta)
+    ends = [spectrum.interval(theta, active, index) if index in active else (0.0, 0.0) for index in (WHITE, FLICKER, WALK)]
+    white, flicker, walk = map(float, np.sqrt(theta))
     drift, drift_sigma = spectrum.drift(theta)
-    return NoiseFit(*(float(value) for value in deviations), *intervals, drift, drift_sigma, len(means) * block_s, block_s)
+    return NoiseFit(white, flicker, walk, ends[0], ends[1], ends[2], drift, drift_sigma, len(means) * block_s, block_s)
 
 
 def spectral_terms(count: int, block_s: float) -> FloatArray:
@@ -145,11 +145,9 @@ class _Spectrum:
             cost, gradient = self._cost(theta)
             return cost, gradient[free] * theta[free]
 
-        best = None
-        for guess in self._guesses(free, start):
-            found = minimize(objective, guess, jac=True, method="L-BFGS-B", bounds=[(-_SPAN, _SPAN)] * len(free))
-            if best is None or found.fun < best.fun:
-                best = found
+        bounds = [(-_SPAN, _SPAN)] * len(free)
+        found = [minimize(objective, guess, jac=True, method="L-BFGS-B", bounds=bounds) for guess in self._guesses(free, start)]
+        best = min(found, key=lambda result: float(result.fun))
         theta[free] = self._scale[free] * np.exp(best.x)
         return theta
 
