@@ -164,12 +164,14 @@ def _svg(figure: Figure, number: int) -> str:
 
 
 def _restyle(figure: Figure) -> None:
-    """Take away what reports do without: the frame's upper and right edge, the backgrounds."""
+    """Take away what reports do without: backgrounds, legends' frames, the upper and right edge."""
     figure.patch.set_facecolor("none")
     for axes in figure.axes:
         axes.patch.set_facecolor("none")
         if not axes.images and axes.get_label() != "<colorbar>" and axes.name == "rectilinear":
             axes.spines[["top", "right"]].set_visible(False)
+        if legend := axes.get_legend():
+            legend.set_frame_on(False)
 
 
 def _png(figure: Figure) -> bytes:
