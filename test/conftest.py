@@ -5,7 +5,12 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import hypothesis
 import pytest
+
+# The first example of a test may compile or load a kernel.
+hypothesis.settings.register_profile("vli", deadline=None)
+hypothesis.settings.load_profile("vli")
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 

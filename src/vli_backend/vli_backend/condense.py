@@ -38,11 +38,19 @@ class Quadratic:
         adjoint = np.zeros((6, 6))
         adjoint[:3, :3] = adjoint[3:, 3:] = rotation
         adjoint[3:, :3] = skew(translation) @ rotation
-        count = len(self.gradient) // 6
-        blocks = self.hessian.reshape(count, 6, count, 6)
-        hessian = np.einsum("ai,kalb,bj->kilj", adjoint, blocks, adjoint, optimize=True).reshape(6 * count, 6 * count)
-        gradient = (self.gradient.reshape(count, 6) @ adjoint).reshape(-1)
+        hessian: FloatArray = _congruent(self.hessian, adjoint)
+        gradient = (self.gradient.reshape(-1, 6) @ adjoint).reshape(-1)
         return Quadratic(hessian, gradient, self.constant)
+
+
+@numba.njit(cache=True, nogil=True)
+def _congruent(hessian, adjoint):  # type: ignore[no-untyped-def]
+    """Return Aᵀ H A for every 6 × 6 block."""
+    out = np.empty(hessian.shape)
+    for i in range(0, len(hessian), 6):
+        for j in range(0, len(hessian), 6):
+            out[i : i + 6, j : j + 6] = adjoint.T @ np.ascontiguousarray(hessian[i : i + 6, j : j + 6]) @ adjoint
+    return out
 
 
 @numba.njit(cache=True, nogil=True)

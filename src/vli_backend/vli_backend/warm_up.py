@@ -30,7 +30,7 @@ def warm_up() -> None:
     scan = LaserScan(0, 0.03 * directions, directions[:, :2], np.ones(50), np.full(50, 5e-5))
     measure_slot(table, 0, poses[0], [(poses[0], scan)], 400.0, config)
     refine(table.arrays, poses, table.usable, 1.0, (2.0, 150.0))
-    condense(table.arrays, poses, table.usable, 1.0)
+    condense(table.arrays, poses, table.usable, 1.0).in_body_frame(np.eye(4))
     found = table.points(poses)
     solve_frame_pose(poses[0], np.eye(6), found.positions, found.spread, rays, np.full(20, 1e-3), 1.0)
     _warm_up_map(poses, scan)

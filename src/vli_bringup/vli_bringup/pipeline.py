@@ -2,28 +2,29 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from concurrent.futures import Future
+from dataclasses import dataclass
 
 from vli_backend.backend import BackEnd
+from vli_bringup.camera_thread import CameraThread, SortedImage
 from vli_bringup.settings import Settings
 from vli_bringup.timing import FrameTimer
 from vli_common.calibration import Calibration
 from vli_common.clock import ClockMonitor
-from vli_common.errors import InputError
 from vli_common.types import (
     BackEndOutput,
     Counters,
     EncodedImage,
     Exposure,
     FrontEndOutput,
-    Image,
     ImuSample,
+    LaserScan,
     MappingOutput,
     Mode,
     WindowPoses,
 )
-from vli_driver.decode import decode
 from vli_driver.demux import Demultiplexer
 from vli_driver.scanner import StripeScanner
 from vli_frontend.frontend import FrontEnd
@@ -61,6 +62,9 @@ class Pipeline:
     The two loops are those of the graph: constraints found with the window of one keyframe enter the solve of the next, eq. (4),
     and the bias of one keyframe enters the preintegration after it.
 
+    An image is worked on when the one after it has come, so that the camera's thread has the time between for decoding and
+    triangulation; order and results are those of one thread.
+
     Args:
         stages: see :meth:`Stages.create`.
         mode: which sensors take part.
@@ -69,77 +73,90 @@ class Pipeline:
     def __init__(self, stages: Stages, mode: Mode) -> None:
         self.stages = stages
         self.timer = FrameTimer()
-        self.counters = Counters()
         self.session = 0
+        self._counters = Counters()
         self._mode = mode
         self._clock = ClockMonitor()
-        self._image_shape: tuple[int, ...] | None = None
+        self._camera = CameraThread(stages.demultiplexer, stages.scanner)
+        self._queue: deque[Future[list[SortedImage]] | ImuSample] = deque()
+
+    @property
+    def counters(self) -> Counters:
+        """Images by exposure, IMU samples, sessions, and what had to be left out."""
+        return Counters({**self._counters.values, **self._camera.counters.values})
 
     def push(self, item: EncodedImage | ImuSample) -> list[Event]:
-        """Take the next item of the source; return what it completed."""
-        stream = "camera" if isinstance(item, EncodedImage) else "IMU"
+        """Take the next item of the source; return what earlier ones completed."""
+        is_image = isinstance(item, EncodedImage)
         events: list[Event] = []
-        if jump := self._clock.jump(stream, item.stamp_ns):
+        if jump := self._clock.jump("camera" if is_image else "IMU", item.stamp_ns):
             events += self._begin_session(jump)
-        if isinstance(item, EncodedImage):
-            events += self._push_image(item)
-        elif self._mode.uses_imu:
-            self.counters.add("imu_samples")
-            with self.timer.measure("frontend"):
-                frames = self.stages.front_end.add_imu(item)
-            events += self._estimate(frames)
+        if isinstance(item, ImuSample):
+            self._queue.append(item)
+            return events
+        sorted_images = self._camera.push(item, self.session)
+        events += self._drain()
+        self._queue.append(sorted_images)
         return events
 
     def flush(self) -> list[Event]:
         """Return what is still held back: images without a verdict, then the window, as final."""
-        events = [event for exposure, image in self.stages.demultiplexer.flush() for event in self._sorted(exposure, image)]
+        self._queue.append(self._camera.flush())
+        events = self._drain()
         with self.timer.measure("backend"):
             window = self.stages.back_end.flush()
-        return [*events, *self._map(window)]
+        events += self._map(window)
+        self.timer.lap()
+        return events
 
     def _begin_session(self, reason: str) -> list[Event]:
         """Finish what the old clock began, then let every stage start anew; the mapper follows with its first new window."""
         events = self.flush()
         self.session += 1
-        self.counters.add("sessions")
+        self._counters.add("sessions")
         self.stages.front_end.reset(self.session)
         self.stages.back_end.reset(self.session, reason)
         return events
 
-    def _push_image(self, encoded: EncodedImage) -> Iterator[Event]:
-        try:
-            with self.timer.measure_unsorted("decode", encoded.stamp_ns):
-                image = replace(decode(encoded), session=self.session)
-        except InputError:
-            self.counters.add("undecodable_images")
-            return
-        self._image_shape = self._image_shape or image.pixels.shape
-        if image.pixels.shape != self._image_shape:
-            self.counters.add("images_of_another_shape")
-            return
-        with self.timer.measure_unsorted("demux", encoded.stamp_ns):
-            ready = self.stages.demultiplexer.push(image)
-        for exposure, sorted_image in ready:
-            yield from self._sorted(exposure, sorted_image)
+    def _drain(self) -> list[Event]:
+        """Work off what has been taken so far."""
+        self.timer.start()
+        events: list[Event] = []
+        while self._queue:
+            item = self._queue.popleft()
+            if isinstance(item, ImuSample):
+                events += self._push_imu(item)
+                continue
+            for sorted_image in item.result():
+                events += self._push_image(sorted_image)
+                self.timer.lap()
+        self.timer.lap()
+        return events
 
-    def _sorted(self, exposure: Exposure, image: Image) -> Iterator[Event]:
-        self.timer.sorted_in(image.stamp_ns, exposure is Exposure.LONG)
-        self.counters.add(f"{exposure.value}_images")
-        if exposure is Exposure.SHORT:
-            self._scan(image)
+    def _push_imu(self, sample: ImuSample) -> Iterator[Event]:
+        if not self._mode.uses_imu:
             return
-        with self.timer.measure("mapping"):
-            self.stages.mapper.add_image(image)
+        self._counters.add("imu_samples")
         with self.timer.measure("frontend"):
-            frames = self.stages.front_end.add_image(image)
+            frames = self.stages.front_end.add_imu(sample)
         yield from self._estimate(frames)
 
-    def _scan(self, short: Image) -> None:
-        """Triangulate the stripe of a short frame, eq. (1), for all who use it."""
-        if self.stages.scanner is None:
+    def _push_image(self, item: SortedImage) -> Iterator[Event]:
+        self.timer.sorted_in(item.image.stamp_ns, item.exposure is Exposure.LONG, item.costs)
+        self._counters.add(f"{item.exposure.value}_images")
+        if item.exposure is Exposure.SHORT:
+            self._add_scan(item.scan)
             return
-        with self.timer.measure("stripe"):
-            scan = self.stages.scanner.scan(short)
+        with self.timer.measure("mapping"):
+            self.stages.mapper.add_image(item.image)
+        with self.timer.measure("frontend"):
+            frames = self.stages.front_end.add_image(item.image)
+        yield from self._estimate(frames)
+
+    def _add_scan(self, scan: LaserScan | None) -> None:
+        """Give the stripe of a short frame to all who use it."""
+        if scan is None:
+            return
         with self.timer.measure("frontend"):
             self.stages.front_end.add_scan(scan)
         with self.timer.measure("backend"):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -15,62 +15,75 @@ from vli_common.arrays import FloatArray
 STAGES = ("decode", "demux", "stripe", "frontend", "backend", "mapping")
 
 _Costs = dict[str, float]
+_TOTAL = "total"
 
 
 class FrameTimer:
-    """Attributes wall time to long frames: a frame's own, its short frame's and its IMU samples', until the next long frame.
+    """Attributes time to long frames: a frame's own, its short frame's and its IMU samples', until the next long frame.
 
-    Decoding and demultiplexing happen before it is known what an image is, so their cost waits under the image's stamp.
+    A stage's column is the time of the thread that did its work. ``total`` is wall time, from the moment that a frame's bytes are
+    taken until all that it and its short frame bring is done, waiting for the camera's thread included; as two threads share the
+    work, it is less than the sum of the stages.
     """
 
     def __init__(self) -> None:
         self._stamps_ns: list[int] = []
         self._rows: list[_Costs] = []
-        self._current: _Costs = dict.fromkeys(STAGES, 0.0)
-        self._waiting: dict[int, _Costs] = {}
+        self._current: _Costs = _no_costs()
+        self._mark_s = 0.0
+
+    def start(self) -> None:
+        """Let the wall time of the frame at hand run."""
+        self._mark_s = time.perf_counter()
+
+    def lap(self) -> None:
+        """Give the wall time since the last start or lap to the frame at hand."""
+        now_s = time.perf_counter()
+        self._current[_TOTAL] += now_s - self._mark_s
+        self._mark_s = now_s
 
     @contextmanager
     def measure(self, stage: str) -> Iterator[None]:
         """Add the time of the block to the frame at hand."""
-        start = time.perf_counter()
+        start_s = time.perf_counter()
         yield
-        self._current[stage] += time.perf_counter() - start
+        self._current[stage] += time.perf_counter() - start_s
 
-    @contextmanager
-    def measure_unsorted(self, stage: str, stamp_ns: int) -> Iterator[None]:
-        """Add the time of the block to the image of this stamp, wherever that will belong."""
-        start = time.perf_counter()
-        yield
-        costs = self._waiting.setdefault(stamp_ns, {})
-        costs[stage] = costs.get(stage, 0.0) + time.perf_counter() - start
+    def sorted_in(self, stamp_ns: int, is_long: bool, costs: Mapping[str, float]) -> None:
+        """Say what an image is and what it has cost so far; a long one is the frame at hand from now on.
 
-    def sorted_in(self, stamp_ns: int, is_long: bool) -> None:
-        """Say what an image is; a long one is the frame at hand from now on."""
+        The wait for this image counts to the frame that it belongs to.
+        """
         if is_long:
             if self._stamps_ns:
-                self._current = dict.fromkeys(STAGES, 0.0)
+                self._current = _no_costs()
             self._stamps_ns.append(stamp_ns)
             self._rows.append(self._current)
-        for stage, seconds in self._waiting.pop(stamp_ns, {}).items():
+        for stage, seconds in costs.items():
             self._current[stage] += seconds
 
     def milliseconds(self) -> FloatArray:
-        """Return (N, 6) ms: a row a long frame, a column a stage of :data:`STAGES`."""
-        return 1e3 * np.array([[row[stage] for stage in STAGES] for row in self._rows]).reshape(-1, len(STAGES))
+        """Return (N, 7) ms: a row a long frame, a column a stage of :data:`STAGES`, and the wall time last."""
+        columns = (*STAGES, _TOTAL)
+        return 1e3 * np.array([[row[column] for column in columns] for row in self._rows]).reshape(-1, len(columns))
 
     def write(self, path: Path) -> None:
         """Write ``timing.csv``."""
         lines = [",".join(["stamp", *(f"{stage}_ms" for stage in STAGES), "total_ms"])]
         for stamp_ns, row in zip(self._stamps_ns, self.milliseconds(), strict=True):
-            lines.append(",".join([seconds_text(stamp_ns), *(f"{value:.3f}" for value in (*row, row.sum()))]))
+            lines.append(",".join([seconds_text(stamp_ns), *(f"{value:.3f}" for value in row)]))
         path.write_text("\n".join(lines) + "\n")
 
     def summary(self) -> dict[str, float | None]:
-        """Return mean and 95th percentile of the time per long frame; None without frames."""
-        total = self.milliseconds().sum(axis=1)
+        """Return mean and 95th percentile of the wall time per long frame; None without frames."""
+        total = self.milliseconds()[:, -1]
         if not len(total):
             return {"ms_per_frame_mean": None, "ms_per_frame_p95": None}
         return {
             "ms_per_frame_mean": round(float(total.mean()), 3),
             "ms_per_frame_p95": round(float(np.percentile(total, 95)), 3),
         }
+
+
+def _no_costs() -> _Costs:
+    return dict.fromkeys((*STAGES, _TOTAL), 0.0)

@@ -9,13 +9,13 @@ import importlib
 import sys
 import time
 
-STAGES = ("vli_driver", "vli_frontend", "vli_backend", "vli_mapping")
+PACKAGES = ("vli_common", "vli_driver", "vli_frontend", "vli_backend", "vli_mapping")
 """Packages with a module ``warm_up``."""
 
 
 def warm_up() -> None:
-    """Compile, or load from numba's cache, every kernel of every stage."""
-    for package in STAGES:
+    """Compile, or load from numba's cache, every kernel of every stage and of what they share."""
+    for package in PACKAGES:
         importlib.import_module(f"{package}.warm_up").warm_up()
 
 

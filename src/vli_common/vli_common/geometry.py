@@ -14,6 +14,11 @@ from vli_common.arrays import FloatArray
 _SMALL = 1e-8
 
 
+def _stack(matrices: FloatArray, size: int) -> FloatArray:
+    """Return (..., size, size) as (N, size, size), as the kernels take it."""
+    return np.ascontiguousarray(matrices, dtype=np.float64).reshape(-1, size, size)
+
+
 def skew(v: FloatArray) -> FloatArray:
     """Return [v]× for (..., 3) as (..., 3, 3)."""
     v = np.asarray(v, dtype=np.float64)
@@ -26,26 +31,14 @@ def skew(v: FloatArray) -> FloatArray:
 
 def so3_exp(omega: FloatArray) -> FloatArray:
     """Return the rotation matrices (..., 3, 3) of rotation vectors (..., 3), by Rodrigues' formula."""
-    omega = np.asarray(omega, dtype=np.float64)
-    angle = np.linalg.norm(omega, axis=-1)[..., None, None]
-    small = angle < _SMALL
-    safe = np.where(small, 1.0, angle)
-    a = np.where(small, 1.0, np.sin(safe) / safe)
-    b = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
-    k = skew(omega)
-    result: FloatArray = np.eye(3) + a * k + b * (k @ k)
+    omega = np.ascontiguousarray(omega, dtype=np.float64)
+    result: FloatArray = _exps(omega.reshape(-1, 3)).reshape(*omega.shape, 3)
     return result
 
 
 def so3_log(rotation: FloatArray) -> FloatArray:
     """Return the rotation vectors (..., 3) of rotation matrices (..., 3, 3); angles in [0, π]."""
-    q = quaternion_from_rotation(rotation)
-    xyz, w = q[..., :3], q[..., 3]
-    norm = np.linalg.norm(xyz, axis=-1)
-    small = norm < _SMALL
-    angle = 2.0 * np.arctan2(norm, w)
-    scale = np.where(small, 2.0, angle / np.where(small, 1.0, norm))
-    result: FloatArray = xyz * scale[..., None]
+    result: FloatArray = _logs(_stack(rotation, 3)).reshape(*rotation.shape[:-2], 3)
     return result
 
 
@@ -71,8 +64,8 @@ def pose(rotation: FloatArray, translation: FloatArray) -> FloatArray:
 
 def inverse(T: FloatArray) -> FloatArray:
     """Return T_b_a of T_a_b, for (..., 4, 4)."""
-    rotation_t = np.swapaxes(T[..., :3, :3], -1, -2)
-    return pose(rotation_t, -(rotation_t @ T[..., :3, 3:])[..., 0])
+    result: FloatArray = _inverses(_stack(T, 4)).reshape(T.shape)
+    return result
 
 
 def transform(T: FloatArray, points: FloatArray) -> FloatArray:
@@ -86,8 +79,8 @@ def transform(T: FloatArray, points: FloatArray) -> FloatArray:
 
 def orthonormalised(T: FloatArray) -> FloatArray:
     """Return a pose (4, 4) with its rotation brought back to SO(3); for poses that are chained, where rounding errors grow."""
-    u, _, vt = np.linalg.svd(T[:3, :3])
-    return pose(u @ vt, T[:3, 3])
+    result: FloatArray = _orthonormalised(_stack(T, 4)[0])
+    return result
 
 
 def interpolate(T0: FloatArray, T1: FloatArray, alpha: FloatArray | float) -> FloatArray:
@@ -101,8 +94,9 @@ def interpolate(T0: FloatArray, T1: FloatArray, alpha: FloatArray | float) -> Fl
     """
     alpha = np.asarray(alpha, dtype=np.float64)
     shape = np.broadcast_shapes(T0.shape[:-2], T1.shape[:-2], alpha.shape)
-    stack = [np.broadcast_to(T, (*shape, 4, 4)).reshape(-1, 4, 4) for T in (T0, T1)]
-    result: FloatArray = _interpolate(stack[0], stack[1], np.broadcast_to(alpha, shape).reshape(-1)).reshape(*shape, 4, 4)
+    # Contiguous, whatever came: a kernel is compiled anew for every layout.
+    start, end = (_stack(np.broadcast_to(T, (*shape, 4, 4)), 4) for T in (T0, T1))
+    result: FloatArray = _interpolate(start, end, np.broadcast_to(alpha, shape).flatten()).reshape(*shape, 4, 4)
     return result
 
 
@@ -139,27 +133,7 @@ def _interpolate(start, end, alpha):  # type: ignore[no-untyped-def]
 
 def quaternion_from_rotation(rotation: FloatArray) -> FloatArray:
     """Return unit quaternions (..., 4) in the order x y z w with w ≥ 0, of rotation matrices (..., 3, 3)."""
-    m = np.asarray(rotation, dtype=np.float64)
-    d = np.stack([m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]], axis=-1)
-    trace = d.sum(axis=-1)
-    # The largest of the four squared components is the safe one to divide by (Shepperd's method).
-    squares = np.concatenate([1 + 2 * d - trace[..., None], (1 + trace)[..., None]], axis=-1)
-    best = np.argmax(squares, axis=-1)
-    x = np.stack(
-        [squares[..., 0], m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 2, 1] - m[..., 1, 2]], axis=-1
-    )
-    y = np.stack(
-        [m[..., 0, 1] + m[..., 1, 0], squares[..., 1], m[..., 1, 2] + m[..., 2, 1], m[..., 0, 2] - m[..., 2, 0]], axis=-1
-    )
-    z = np.stack(
-        [m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1], squares[..., 2], m[..., 1, 0] - m[..., 0, 1]], axis=-1
-    )
-    w = np.stack(
-        [m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1], squares[..., 3]], axis=-1
-    )
-    q = np.take_along_axis(np.stack([x, y, z, w], axis=-2), best[..., None, None], axis=-2)[..., 0, :]
-    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    result: FloatArray = np.where(q[..., 3:] < 0, -q, q)
+    result: FloatArray = _quaternions(_stack(rotation, 3)).reshape(*rotation.shape[:-2], 4)
     return result
 
 
@@ -200,3 +174,80 @@ def align(source: FloatArray, target: FloatArray, with_scale: bool = False) -> t
     variance = float((centred_s**2).sum() / len(source))
     scale = float(singular @ sign) / variance if with_scale and variance > 0 else 1.0
     return pose(rotation, mean_t - scale * rotation @ mean_s), scale
+
+
+# One pose costs numpy a dozen small calls, and every frame asks for some; hence kernels.
+
+
+@numba.njit(cache=True, nogil=True)
+def _quaternions(m):  # type: ignore[no-untyped-def]
+    """Shepperd's method: the largest of the four squared components is the safe one to divide by."""
+    out = np.empty((len(m), 4))
+    for i in range(len(m)):
+        r = m[i]
+        trace = r[0, 0] + r[1, 1] + r[2, 2]
+        best, value = 3, 1.0 + trace
+        for k in range(3):
+            if 1.0 + 2.0 * r[k, k] - trace > value:
+                best, value = k, 1.0 + 2.0 * r[k, k] - trace
+        q = out[i]
+        if best == 3:
+            q[0], q[1], q[2], q[3] = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], value
+        else:
+            a, b = (best + 1) % 3, (best + 2) % 3
+            q[best], q[a], q[b], q[3] = value, r[a, best] + r[best, a], r[b, best] + r[best, b], r[b, a] - r[a, b]
+        norm = np.sqrt((q**2).sum())
+        if q[3] < 0.0:
+            norm = -norm
+        q /= norm
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _logs(m):  # type: ignore[no-untyped-def]
+    q = _quaternions(m)
+    out = np.empty((len(m), 3))
+    for i in range(len(m)):
+        norm = np.sqrt(q[i, 0] ** 2 + q[i, 1] ** 2 + q[i, 2] ** 2)
+        scale = 2.0 if norm < _SMALL else 2.0 * np.arctan2(norm, q[i, 3]) / norm
+        out[i] = q[i, :3] * scale
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _inverses(T):  # type: ignore[no-untyped-def]
+    out = np.zeros(T.shape)
+    for i in range(len(T)):
+        for m in range(3):
+            for n in range(3):
+                out[i, m, n] = T[i, n, m]
+                out[i, m, 3] -= T[i, n, m] * T[i, n, 3]
+        out[i, 3, 3] = 1.0
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _exps(omega):  # type: ignore[no-untyped-def]
+    out = np.empty((len(omega), 3, 3))
+    for i in range(len(omega)):
+        x, y, z = omega[i]
+        angle = np.sqrt(x * x + y * y + z * z)
+        a, b = 1.0, 0.5
+        if angle >= _SMALL:
+            # 1 − cos as 2 sin²(θ/2), which does not cancel.
+            a, b = np.sin(angle) / angle, 2.0 * (np.sin(0.5 * angle) / angle) ** 2
+        out[i, 0] = 1.0 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y
+        out[i, 1] = b * x * y + a * z, 1.0 - b * (x * x + z * z), b * y * z - a * x
+        out[i, 2] = b * x * z - a * y, b * y * z + a * x, 1.0 - b * (x * x + y * y)
+    return out
+
+
+@numba.njit(cache=True, nogil=True)
+def _orthonormalised(T):  # type: ignore[no-untyped-def]
+    """Newton's iteration to the polar factor; it doubles the digits, and chained poses have lost but the last few."""
+    out = T.copy()
+    r = np.ascontiguousarray(out[:3, :3])
+    for _ in range(3):
+        r = r @ (1.5 * np.eye(3) - 0.5 * (r.T @ r))
+    out[:3, :3] = r
+    return out

@@ -30,41 +30,54 @@ def column(timer, stage):
 def test_a_short_frame_and_the_imu_count_to_the_long_frame_before(spend):
     timer = FrameTimer()
     for stamp, is_long, decoding in ((10, True, 5), (20, False, 3), (30, True, 7)):
-        with timer.measure_unsorted("decode", stamp):
-            spend(decoding)
-        timer.sorted_in(stamp, is_long)
+        timer.sorted_in(stamp, is_long, {"decode": 1e-3 * decoding})
         with timer.measure("frontend"):
             spend(1)
     np.testing.assert_allclose(column(timer, "decode"), [8, 7])
     np.testing.assert_allclose(column(timer, "frontend"), [2, 1])
-    assert timer.summary()["ms_per_frame_mean"] == pytest.approx(9)
 
 
-def test_images_that_wait_for_a_verdict_keep_their_cost(spend):
+def test_the_wait_for_an_image_counts_to_the_frame_it_belongs_to(spend):
     timer = FrameTimer()
-    for stamp, decoding in ((10, 5), (20, 3), (30, 7)):
-        with timer.measure_unsorted("decode", stamp):
-            spend(decoding)
-    for stamp, is_long in ((10, True), (20, False), (30, True)):
-        timer.sorted_in(stamp, is_long)
-    np.testing.assert_allclose(column(timer, "decode"), [8, 7])
+    for stamp, is_long, wait in ((10, True, 5), (20, False, 3), (30, True, 7)):
+        timer.start()
+        spend(wait)
+        timer.sorted_in(stamp, is_long, {})
+        timer.lap()
+        spend(100)
+    np.testing.assert_allclose(timer.milliseconds()[:, -1], [8, 7])
+    assert timer.summary()["ms_per_frame_mean"] == pytest.approx(7.5)
+
+
+def test_wall_time_is_counted_once_where_two_threads_work(spend):
+    timer = FrameTimer()
+    timer.start()
+    timer.sorted_in(10, True, {"decode": 4e-3, "stripe": 1e-3})
+    with timer.measure("frontend"):
+        spend(6)
+    timer.lap()
+    assert timer.summary() == {"ms_per_frame_mean": pytest.approx(6), "ms_per_frame_p95": pytest.approx(6)}
 
 
 def test_what_comes_before_the_first_long_frame_counts_to_it(spend):
     timer = FrameTimer()
+    timer.start()
     with timer.measure("frontend"):
         spend(4)
-    timer.sorted_in(10, True)
-    np.testing.assert_allclose(timer.milliseconds().sum(), 4)
+    timer.lap()
+    timer.sorted_in(10, True, {})
+    np.testing.assert_allclose(timer.milliseconds()[:, -1], 4)
 
 
 def test_the_file_has_a_row_a_frame_and_its_stamp_to_the_nanosecond(spend, tmp_path):
     timer = FrameTimer()
-    timer.sorted_in(1_700_000_000_123_456_789, True)
+    timer.start()
+    timer.sorted_in(1_700_000_000_123_456_789, True, {})
     with timer.measure("backend"):
         spend(2)
     with timer.measure("mapping"):
         spend(1)
+    timer.lap()
     timer.write(tmp_path / "timing.csv")
     rows = list(csv.DictReader((tmp_path / "timing.csv").open()))
     assert len(rows) == 1
