@@ -94,8 +94,8 @@ def interpolate(T0: FloatArray, T1: FloatArray, alpha: FloatArray | float) -> Fl
     """
     alpha = np.asarray(alpha, dtype=np.float64)
     shape = np.broadcast_shapes(T0.shape[:-2], T1.shape[:-2], alpha.shape)
-    # Contiguous, whatever came: a kernel is compiled anew for every layout.
-    start, end = (_stack(np.broadcast_to(T, (*shape, 4, 4)), 4) for T in (T0, T1))
+    # Copies: a kernel is compiled anew for what is strided or read-only.
+    start, end = (np.array(np.broadcast_to(T, (*shape, 4, 4)), order="C").reshape(-1, 4, 4) for T in (T0, T1))
     result: FloatArray = _interpolate(start, end, np.broadcast_to(alpha, shape).flatten()).reshape(*shape, 4, 4)
     return result
 

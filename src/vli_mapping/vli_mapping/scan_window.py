@@ -84,7 +84,7 @@ class PosedScan:
     @property
     def viewpoint(self) -> FloatArray:
         """Camera centre (3,) in map."""
-        viewpoint: FloatArray = self.T_map_camera[:3, 3]
+        viewpoint: FloatArray = self.T_map_camera[:3, 3].copy()
         return viewpoint
 
 
