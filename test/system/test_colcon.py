@@ -16,7 +16,16 @@ import rclpy
 
 pytestmark = pytest.mark.graph
 
-PACKAGES = ["vli_backend", "vli_bringup", "vli_common", "vli_driver", "vli_frontend", "vli_mapping", "vli_simulation"]
+PACKAGES = [
+    "vli_backend",
+    "vli_bringup",
+    "vli_calibration",
+    "vli_common",
+    "vli_driver",
+    "vli_frontend",
+    "vli_mapping",
+    "vli_simulation",
+]
 NODES = {
     "driver_node": "vli_driver",
     "demux_node": "vli_driver",

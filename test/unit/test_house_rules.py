@@ -95,7 +95,7 @@ def install_requires(package: str) -> set[str]:
 
 
 def test_there_are_sources_to_check():
-    assert STAGES | {"vli_common", "vli_bringup", "vli_simulation"} <= set(PACKAGES)
+    assert STAGES | {"vli_common", "vli_bringup", "vli_simulation", "vli_calibration"} <= set(PACKAGES)
     assert all(any(module.package == package for module in MODULES) for package in PACKAGES)
 
 
