@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from vli_bringup.consistency import COVARIANCES, ConsistencyFigures, consistency_figures, read_covariances
 from vli_bringup.evaluation_data import has_colour, number, read_cloud, read_json, read_passes, read_surface
 from vli_bringup.map_metrics import (
     CompletenessFigures,
@@ -160,9 +161,14 @@ def evaluate(sources: Sources, poses_from_s: float = STARTUP_S) -> Result:
     mapped, surface, completeness = _compare_map(cloud, T_truth_map, sources)
     share = poses_share(live.stamps_ns, truth.stamps_ns, poses_from_s)
     run_figures = _run_figures(sources.run, share, poses_from_s, None if cloud is None else len(cloud))
-    return Result(
-        Evaluation(run_figures, live_figures, final_figures, surface, completeness), live_errors, final_errors, passes, mapped
-    )
+    consistency = _consistency(sources.run, live_pairs)
+    figures_of_run = Evaluation(run_figures, live_figures, final_figures, surface, completeness, consistency)
+    return Result(figures_of_run, live_errors, final_errors, passes, mapped)
+
+
+def _consistency(directory: Path, pairs: Association) -> ConsistencyFigures:
+    path = directory / COVARIANCES
+    return consistency_figures(pairs, *read_covariances(path)) if path.is_file() else ConsistencyFigures()
 
 
 def _final_pairs(directory: Path, truth: Trajectory) -> Association | None:

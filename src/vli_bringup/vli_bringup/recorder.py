@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from vli_bringup.consistency import COVARIANCES, camera_covariance, covariance_text
 from vli_bringup.pipeline import Event
 from vli_bringup.stamps import seconds_text
 from vli_common.arrays import FloatArray
@@ -30,6 +31,8 @@ class Recorder:
         """Stamp of a long frame → T_map_camera (4, 4), as published."""
         self.final: dict[int, FloatArray] = {}
         """The same for frames that have left the window."""
+        self.covariances: dict[int, FloatArray] = {}
+        """Stamp → covariance (6, 6) of the live pose of the camera, order of ROS, axes of map; where it was given."""
         self.states: list[tuple[float, str, str]] = []
         """Stamp in seconds, state and reason, at each change of the state."""
         self.reason = "no long frame reached the back end"
@@ -49,14 +52,18 @@ class Recorder:
                 self._add_window(event)
 
     def write(self, directory: Path) -> None:
-        """Write ``trajectory.tum`` and ``trajectory_final.tum``."""
+        """Write ``trajectory.tum`` and ``trajectory_final.tum``; ``covariance.csv`` where covariances were given."""
         final = {stamp: self.final[stamp] for stamp in self.live if stamp in self.final}
         (directory / "trajectory.tum").write_text(tum_text(self.live))
         (directory / "trajectory_final.tum").write_text(tum_text(final))
+        if self.covariances:
+            (directory / COVARIANCES).write_text(covariance_text(self.covariances))
 
-    def add_pose(self, stamp_ns: int, T_map_imu: FloatArray) -> None:
-        """Take the pose of one long frame, as published."""
+    def add_pose(self, stamp_ns: int, T_map_imu: FloatArray, covariance: FloatArray | None = None) -> None:
+        """Take the pose of one long frame, as published, and its covariance (6, 6), where that is known."""
         self.live[stamp_ns] = T_map_imu @ self._T_imu_camera
+        if covariance is not None:
+            self.covariances[stamp_ns] = camera_covariance(covariance, T_map_imu, self._T_imu_camera)
 
     def add_state(self, stamp_ns: int, state: TrackingState, reason: str) -> None:
         """Take what the back end says of a frame; the states keep its changes only."""
@@ -66,7 +73,7 @@ class Recorder:
 
     def _add_output(self, output: BackEndOutput) -> None:
         if output.pose is not None and output.state.has_pose:
-            self.add_pose(output.stamp_ns, output.pose.T_map_imu)
+            self.add_pose(output.stamp_ns, output.pose.T_map_imu, output.pose.covariance)
         self.add_state(output.stamp_ns, output.state, output.reason)
 
     def _add_window(self, window: WindowPoses) -> None:

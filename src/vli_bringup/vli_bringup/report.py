@@ -10,6 +10,7 @@ import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+from vli_bringup.consistency import ConsistencyFigures
 from vli_bringup.map_metrics import CompletenessFigures, SurfaceFigures
 from vli_bringup.trajectory_metrics import TrajectoryFigures
 
@@ -45,6 +46,7 @@ class Evaluation:
     final: TrajectoryFigures | None
     surface: SurfaceFigures | None
     completeness: CompletenessFigures | None
+    consistency: ConsistencyFigures
 
 
 def as_dict(evaluation: Evaluation) -> dict[str, Value]:
@@ -56,6 +58,7 @@ def as_dict(evaluation: Evaluation) -> dict[str, Value]:
     out |= {f"final_{key}": value for key, value in _fields(TrajectoryFigures, evaluation.final).items()}
     out |= _fields(SurfaceFigures, evaluation.surface)
     out |= _fields(CompletenessFigures, evaluation.completeness)
+    out |= dataclasses.asdict(evaluation.consistency)
     out |= dataclasses.asdict(evaluation.run)
     return out
 
@@ -110,6 +113,8 @@ def _further(figures: Mapping[str, Value]) -> str:
     rows = [
         row(f"long frames with a pose, from {figures['poses_share_from_s']:g} s on, %", ".2f", "poses_share_percent"),
         row("tilt of map against truth, live / final, mrad", ".2f", "tilt_rad", "final_tilt_rad", factor=1e3),
+        row("NEES of the position (3: consistent)", ".2f", "position_nees"),
+        row("sigma of the last position, mm", ".3f", "position_sigma_mm"),
         row("map points", ",.0f", "points"),
         row("point-to-plane median, mm", ".3f", "map_point_to_plane_median_mm"),
         row("map points beyond 0.5 / 1 mm, %", ".2f", "beyond_0_5mm_percent", "beyond_1mm_percent"),

@@ -14,6 +14,7 @@ from PIL import Image
 from trajectories import disturbed, moved, part, wavy, write_tum
 
 from vli_bringup import cli, evaluation
+from vli_bringup.consistency import covariance_text
 from vli_bringup.report import as_dict
 from vli_bringup.trajectory_metrics import align_poses
 from vli_common import ply
@@ -88,6 +89,16 @@ def test_the_figures_of_a_known_case(scan: Path) -> None:
     assert figures["points"] == pytest.approx(10_000, rel=0.05)
     assert figures["ms_per_frame_mean"] == 7.25
     assert math.isnan(figures["realtime_factor"])
+
+
+def test_covariances_beside_the_trajectory_give_its_nees(scan: Path) -> None:
+    assert math.isnan(figures_of(scan)["position_nees"])
+    stamps = wavy().stamps_ns[40::2].tolist()
+    write(covariance_text(dict.fromkeys(stamps, 1e-6 * np.eye(6))), "run", "covariance.csv")(scan)
+    wide = figures_of(scan)["position_nees"]
+    write(covariance_text(dict.fromkeys(stamps, 1e-8 * np.eye(6))), "run", "covariance.csv")(scan)
+    assert figures_of(scan)["position_nees"] == pytest.approx(100 * wide)
+    assert figures_of(scan)["position_sigma_mm"] == pytest.approx(np.sqrt(3) * 0.1)
 
 
 def test_rotation_and_map_are_aligned_by_the_final_trajectory(scan: Path) -> None:
@@ -254,6 +265,7 @@ def break_map(scan: Path) -> None:
         (write('{"passes": [[1, 2, 3]]}', "truth", "passes.json"), "passes.json' cannot be used"),
         (write('{"passes": [[5, 4]]}', "truth", "passes.json"), "a pass starts at '5.000' and ends at '4.000'"),
         (write("{", "run", "summary.json"), "summary.json' is not JSON"),
+        (write("stamp,x\n", "run", "covariance.csv"), "covariance.csv' begin with 'stamp,x', expected"),
     ],
 )
 def test_a_bad_input_is_one_line_and_exit_code_2(
