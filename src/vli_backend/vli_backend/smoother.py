@@ -7,6 +7,8 @@ iteration. What leaves with the oldest keyframe is handed over separately at the
 
 from __future__ import annotations
 
+import functools
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -204,20 +206,17 @@ class GtsamSmoother:
     def _to_container(self, quadratic: Quadratic, skip: int = 0) -> gtsam.LinearContainerFactor:
         """Return the quadratic, without its ``skip`` oldest poses, as one factor.
 
-        It is summed up from pairs: from Python GTSAM takes no larger Hessian factor.
+        It is summed up from factors of three poses: from Python GTSAM takes no larger one.
         """
         keys = [X(k) for k in range(self._first + skip, self._first + self._count)]
+        h, g = quadratic.hessian[6 * skip :, 6 * skip :], -quadratic.gradient[6 * skip :]
         blocks = gtsam.GaussianFactorGraph()
-        count, h, g = len(keys), quadratic.hessian[6 * skip :, 6 * skip :], -quadratic.gradient[6 * skip :]
-        zero, none = np.zeros((6, 6)), np.zeros(6)
-        for i in range(count):
-            a = slice(6 * i, 6 * i + 6)
-            constant = quadratic.constant if i == 0 else 0.0
-            blocks.push_back(gtsam.HessianFactor(keys[i], h[a, a], g[a], constant))
-            for j in range(i + 1, count):
-                b = slice(6 * j, 6 * j + 6)
-                if h[a, b].any():
-                    blocks.push_back(gtsam.HessianFactor(keys[i], keys[j], zero, h[a, b], none, zero, none, 0.0))
+        constant = quadratic.constant
+        for poses, carries in _cover(len(keys)):
+            rows = (6 * np.array(poses)[:, None] + np.arange(6)).ravel()
+            part = h[np.ix_(rows, rows)] * carries
+            blocks.push_back(_hessian([keys[i] for i in poses], part, g[rows] * carries.diagonal(), constant))
+            constant = 0.0
         point = gtsam.Values()
         for key in keys:
             point.insert(key, self._estimate.atPose3(key))
@@ -249,6 +248,36 @@ class GtsamSmoother:
             self._estimate = self._smoother.calculateEstimate()
         except (RuntimeError, ValueError) as error:
             raise SmootherError(_first_line(error)) from error
+
+
+@functools.cache
+def _cover(count: int) -> tuple[tuple[tuple[int, ...], FloatArray], ...]:
+    """Return groups of up to three of ``count`` poses that hold every pair, and which blocks each carries: (6n, 6n), 0 or 1."""
+    missing = {(i, j) for i in range(count) for j in range(i, count)}
+    groups = []
+    while missing:
+        group = max(itertools.combinations(range(count), min(count, 3)), key=lambda item: len(_pairs(item) & missing))
+        fresh = _pairs(group) & missing
+        missing -= fresh
+        carries = np.array([[float((min(i, j), max(i, j)) in fresh) for j in group] for i in group])
+        groups.append((group, np.kron(carries, np.ones((6, 6)))))
+    return tuple(groups)
+
+
+def _pairs(group: tuple[int, ...]) -> set[tuple[int, int]]:
+    return set(itertools.combinations_with_replacement(group, 2))
+
+
+def _hessian(keys: list[int], h: FloatArray, g: FloatArray, f: float) -> gtsam.HessianFactor:
+    """Return the factor ½ δᵀ h δ − gᵀ δ + ½ f of one to three poses."""
+    a, b, c = slice(0, 6), slice(6, 12), slice(12, 18)
+    if len(keys) == 1:
+        return gtsam.HessianFactor(keys[0], h, g, f)
+    if len(keys) == 2:
+        return gtsam.HessianFactor(keys[0], keys[1], h[a, a], h[a, b], g[a], h[b, b], g[b], f)
+    return gtsam.HessianFactor(
+        keys[0], keys[1], keys[2], h[a, a], h[a, b], h[a, c], g[a], h[b, b], h[b, c], g[b], h[c, c], g[c], f
+    )
 
 
 def _insert(values: gtsam.Values, index: int, pose: gtsam.Pose3, state: KeyframeState) -> None:
