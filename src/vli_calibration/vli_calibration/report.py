@@ -35,6 +35,8 @@ _SVG_AT_MOST = 400_000
 """Bytes; a drawing of more, thousands of points, is smaller as pixels."""
 
 _PNG_DPI = 160
+_NAME_AT_MOST = 28
+"""Characters; a longer cell is a sentence."""
 
 
 class Verdict(Enum):
@@ -69,8 +71,8 @@ class Report:
         self._blocks: list[_Block] = []
 
     def verdict(self, level: Verdict, sentence: str) -> None:
-        """Say what the calibration is worth, in words, and what to do about it."""
-        self._verdict = level, sentence
+        """Say what the calibration is worth, in words, and what to do about it; the level may stand before it and a colon."""
+        self._verdict = level, sentence.removeprefix(f"{level.value}: ")
 
     def heading(self, text: str) -> None:
         """Begin a section."""
@@ -89,7 +91,7 @@ class Report:
         """Add a table; columns of figures are set to the right, floats shown with four digits, None as a dash."""
         cells = [[cell_text(value) for value in row] for row in rows]
         columns = list(zip(*cells, strict=True)) if cells else [()] * len(header)
-        self._add("table", header=list(header), rows=cells, right=[is_figures(column) for column in columns], caption=caption)
+        self._add("table", header=list(header), rows=cells, styles=[_style(column) for column in columns], caption=caption)
 
     def figure(self, figure: Figure, caption: str) -> None:
         """Add a drawing: as SVG in the colours of the page, as PNG where that is smaller."""
@@ -136,6 +138,13 @@ def make_figure(width: float = 7.0, height: float = 3.6) -> Figure:
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")
+
+
+def _style(cells: Sequence[str]) -> str:
+    """Return the class of a column: figures to the right, sentences broken into lines, names never."""
+    if is_figures(cells):
+        return "right"
+    return "sentence" if any(len(cell) > _NAME_AT_MOST for cell in cells) else ""
 
 
 @functools.cache
