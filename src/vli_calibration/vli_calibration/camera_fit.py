@@ -13,7 +13,7 @@ from vli_calibration.bundle import BundleState, Observation, residuals, solve
 from vli_calibration.camera_start import starting_state
 from vli_calibration.lens import LENSES, Lens
 from vli_calibration.loo import LeaveOneOut, leave_one_out
-from vli_calibration.robust import kept_corners
+from vli_calibration.robust import kept_corners, view_weights
 from vli_calibration.targets import Target
 from vli_calibration.types import Detection, Rejection
 from vli_common.arrays import BoolArray, FloatArray
@@ -27,7 +27,7 @@ _LEAST_CORNERS = 8
 _LEAST_SHARE = 0.4
 _REJECTIONS = 12
 _OUTLYING = 3.5
-_LEAST_LOG_SPREAD = 0.25
+_LEAST_LOG_SPREAD = 0.4
 _CONFIDENCE = 0.95
 _FOCAL_UNKNOWN = 0.10
 
@@ -127,25 +127,31 @@ class CameraFit:
 
 @dataclass(slots=True)
 class _Problem:
-    """The views still in play; ``kept`` follows them."""
+    """The views still in play; ``kept`` and ``weights`` follow them."""
 
     lens: Lens
     views: list[View]
     observations: list[Observation]
     state: BundleState
     kept: list[BoolArray]
+    weights: FloatArray
 
     def without(self, index: int) -> _Problem:
         rest = [i for i in range(len(self.views)) if i != index]
         state = BundleState(self.state.parameters, self.state.poses[rest])
         return _Problem(
-            self.lens, [self.views[i] for i in rest], [self.observations[i] for i in rest], state, [self.kept[i] for i in rest]
+            self.lens,
+            [self.views[i] for i in rest],
+            [self.observations[i] for i in rest],
+            state,
+            [self.kept[i] for i in rest],
+            self.weights[rest],
         )
 
     def weighted(self) -> list[Observation]:
         return [
-            Observation(seen.points, seen.pixels, kept.astype(np.float64))
-            for seen, kept in zip(self.observations, self.kept, strict=True)
+            Observation(seen.points, seen.pixels, weight * kept)
+            for seen, kept, weight in zip(self.observations, self.kept, self.weights, strict=True)
         ]
 
     def errors(self) -> list[FloatArray]:
@@ -176,7 +182,8 @@ def fit_camera(views: Sequence[View], target: Target, resolution: tuple[int, int
         raise InputError(
             f"no camera of model '{model}' sees the board '{target.spec}' like this; check that --target describes the printed one"
         )
-    problem = _Problem(lens, usable, observations, state, [np.ones(len(view.detection), dtype=bool) for view in usable])
+    everything = [np.ones(len(view.detection), dtype=bool) for view in usable]
+    problem = _Problem(lens, usable, observations, state, everything, np.ones(len(usable)))
     _refine(problem)
     for _ in range(len(usable)):
         left_out = leave_one_out(lens, problem.state, problem.weighted())
@@ -206,7 +213,9 @@ def tilt_span_deg(T_cam_board: Sequence[FloatArray]) -> float:
 def _refine(problem: _Problem) -> None:
     """Alternate between the fit and the choice of corners until the choice rests."""
     for _ in range(_REJECTIONS):
-        kept = kept_corners(problem.errors())
+        errors = problem.errors()
+        kept = kept_corners(errors)
+        problem.weights = view_weights(errors, kept)
         same = all((old == new).all() for old, new in zip(problem.kept, kept, strict=True))
         problem.kept = kept
         problem.state = solve(problem.lens, problem.state, problem.weighted())
@@ -267,7 +276,10 @@ def _result(
     errors = problem.errors()
     kept_errors = np.vstack([error[kept] for error, kept in zip(errors, problem.kept, strict=True)])
     freedom = max(kept_errors.size - 6 * len(errors) - len(problem.state.parameters), 1)
-    covariance = float((kept_errors**2).sum()) / freedom * left_out.information_inverse
+    cost = sum(
+        float((seen.weights[:, None] * error**2).sum()) for seen, error in zip(problem.weighted(), errors, strict=True)
+    )
+    covariance = cost / freedom * left_out.information_inverse
     sigma = np.sqrt(np.maximum(covariance.diagonal(), left_out.jackknife_variance))
     focal = problem.state.parameters[:2]
     if (sigma[:2] > _FOCAL_UNKNOWN * focal).any():

@@ -7,8 +7,8 @@ import numpy as np
 
 from vli_common.arrays import BoolArray, ByteArray, FloatArray, Float32Array
 
-_WINDOW_OF_SIDE = 0.4
-"""Half the search window over the distance to the nearest corner: as much edge as there is, nothing of the next corner."""
+_WINDOW_OF_SIDE = 0.3
+"""Half the search window over the distance to the nearest corner: enough edge, and stripes further off do no harm."""
 _WINDOW_PX = (2, 30)
 _BLUR_PX = 1.0
 _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 60, 1e-3)
