@@ -78,12 +78,13 @@ def starting_pose(camera: CameraModel, points: FloatArray, pixels: FloatArray) -
     # The plane's own pose methods want its origin amid the points.
     centre = points[seen].mean(axis=0)
     try:
-        count, turns, shifts, _ = cv2.solvePnPGeneric(
-            points[seen] - centre, rays[seen], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
-        )
+        count, turns, shifts, _ = cv2.solvePnPGeneric(points[seen] - centre, rays[seen], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
     except cv2.error:
         return None
-    poses = [np.concatenate([turn.ravel(), shift.ravel() - cv2.Rodrigues(turn)[0] @ centre]) for turn, shift in zip(turns, shifts, strict=True)]
+    poses = [
+        np.concatenate([turn.ravel(), shift.ravel() - cv2.Rodrigues(turn)[0] @ centre])
+        for turn, shift in zip(turns, shifts, strict=True)
+    ]
     poses = [pose for pose in poses if np.isfinite(pose).all() and _in_front(pose, points)]
     return poses[0] if count and poses else None
 

@@ -276,9 +276,7 @@ def _result(
     errors = problem.errors()
     kept_errors = np.vstack([error[kept] for error, kept in zip(errors, problem.kept, strict=True)])
     freedom = max(kept_errors.size - 6 * len(errors) - len(problem.state.parameters), 1)
-    cost = sum(
-        float((seen.weights[:, None] * error**2).sum()) for seen, error in zip(problem.weighted(), errors, strict=True)
-    )
+    cost = sum(float((seen.weights[:, None] * error**2).sum()) for seen, error in zip(problem.weighted(), errors, strict=True))
     covariance = cost / freedom * left_out.information_inverse
     sigma = np.sqrt(np.maximum(covariance.diagonal(), left_out.jackknife_variance))
     focal = problem.state.parameters[:2]

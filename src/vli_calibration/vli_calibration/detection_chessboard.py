@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from vli_calibration.boards import Chessboard
+from vli_calibration.contrast import equalised, flattened, scaled
 from vli_calibration.subpixel import board_grey, nearest_neighbour_px, refine
 from vli_calibration.types import Detection
 from vli_common.arrays import ByteArray, FloatArray
@@ -36,8 +37,8 @@ def detect_chessboard(target: Chessboard, pixels: ByteArray) -> Detection | str:
     """
     grey = board_grey(pixels)
     found = _find(target, grey)
-    if found is None:
-        return _reason(target, grey)
+    if isinstance(found, str):
+        return found
     corners = _oriented(target, grey, found)
     refined, stayed = refine(grey, corners, nearest_neighbour_px(corners))
     return Detection(np.flatnonzero(stayed).astype(np.int64), refined[stayed])
@@ -46,16 +47,32 @@ def detect_chessboard(target: Chessboard, pixels: ByteArray) -> Detection | str:
 def seen_size(grey: ByteArray) -> tuple[int, int] | None:
     """Return columns and rows, the larger first, of whatever chessboard of 3 × 3 inner corners or more is there."""
     scale = min(1.0, _FIRST_SIDE_PX / max(grey.shape))
-    for image in (_clahe(_scaled(grey, scale)), _flattened(_scaled(grey, scale))):
+    for image in (equalised(scaled(grey, scale)), flattened(scaled(grey, scale))):
         ok, _, meta = cv2.findChessboardCornersSBWithMeta(image, _SMALLEST_GATE, flags=cv2.CALIB_CB_LARGER)
         if ok and meta is not None:
             return max(meta.shape[:2]), min(meta.shape[:2])
     return None
 
 
-def _find(target: Chessboard, grey: ByteArray) -> FloatArray | None:
-    """Return the corners (N, 2) in full-size pixels, in the finder's order."""
-    for image, flags, scale in _attempts(grey):
+def _find(target: Chessboard, grey: ByteArray) -> FloatArray | str:
+    """Return the corners (N, 2) in full-size pixels, in the finder's order, or why there are none.
+
+    The expensive attempts are made only where some chessboard is seen.
+    """
+    longest = max(grey.shape)
+    first = min(1.0, _FIRST_SIDE_PX / longest)
+    corners = _first_found(target, _cheap_attempts(grey, first))
+    if corners is not None:
+        return corners
+    size = seen_size(grey)
+    if size is None:
+        return _why_nothing(grey)
+    corners = _first_found(target, _costly_attempts(grey, first))
+    return _why_not_this(target, size) if corners is None else corners
+
+
+def _first_found(target: Chessboard, attempts: Iterator[tuple[ByteArray, int, float]]) -> FloatArray | None:
+    for image, flags, scale in attempts:
         ok, corners = cv2.findChessboardCornersSB(image, (target.columns, target.rows), flags=flags)
         if ok:
             full: FloatArray = (corners.reshape(-1, 2).astype(np.float64) + 0.5) / scale - 0.5
@@ -63,38 +80,19 @@ def _find(target: Chessboard, grey: ByteArray) -> FloatArray | None:
     return None
 
 
-def _attempts(grey: ByteArray) -> Iterator[tuple[ByteArray, int, float]]:
-    """Yield image, flags and scale, cheapest first; the expensive ones only where something like a chessboard is seen."""
-    longest = max(grey.shape)
-    first = min(1.0, _FIRST_SIDE_PX / longest)
-    yield _clahe(_scaled(grey, first)), 0, first
-    yield _flattened(_scaled(grey, first)), 0, first
-    if seen_size(grey) is None:
-        return
+def _cheap_attempts(grey: ByteArray, first: float) -> Iterator[tuple[ByteArray, int, float]]:
+    """Yield image, flags and scale."""
+    yield equalised(scaled(grey, first)), 0, first
+    yield flattened(scaled(grey, first)), 0, first
+
+
+def _costly_attempts(grey: ByteArray, first: float) -> Iterator[tuple[ByteArray, int, float]]:
     second = min(2 * first, 1.0) if first < 1 else 2.0
-    yield _clahe(_scaled(grey, first / 2)), 0, first / 2
-    yield _clahe(_scaled(grey, second)), 0, second
-    yield _flattened(_scaled(grey, second)), 0, second
-    yield _clahe(_scaled(grey, first)), cv2.CALIB_CB_EXHAUSTIVE, first
-    yield _flattened(_scaled(grey, first)), cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE, first
-
-
-def _scaled(grey: ByteArray, scale: float) -> ByteArray:
-    if scale == 1.0:
-        return grey
-    way = cv2.INTER_AREA if scale < 1 else cv2.INTER_CUBIC
-    return np.asarray(cv2.resize(grey, None, fx=scale, fy=scale, interpolation=way), dtype=np.uint8)
-
-
-def _clahe(grey: ByteArray) -> ByteArray:
-    return np.asarray(cv2.createCLAHE(clipLimit=4.0, tileGridSize=(8, 8)).apply(grey), dtype=np.uint8)
-
-
-def _flattened(grey: ByteArray) -> ByteArray:
-    """Divide by the light round about: glare, the laser's glow and the lamp's fall-off leave."""
-    image = grey.astype(np.float32) + 4.0
-    light = cv2.GaussianBlur(image, (0, 0), max(grey.shape) / 25)
-    return np.clip(110.0 * image / light, 0, 255).astype(np.uint8)
+    for scale in (first / 2, second):
+        yield equalised(scaled(grey, scale)), 0, scale
+        yield flattened(scaled(grey, scale)), 0, scale
+    yield equalised(scaled(grey, first)), cv2.CALIB_CB_EXHAUSTIVE, first
+    yield flattened(scaled(grey, first)), cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE, first
 
 
 def _oriented(target: Chessboard, grey: ByteArray, corners: FloatArray) -> FloatArray:
@@ -132,16 +130,16 @@ def _darkness_of_first(grey: ByteArray, grid: FloatArray) -> float:
     return float(np.median(values[~even]) - np.median(values[even]))
 
 
-def _reason(target: Chessboard, grey: ByteArray) -> str:
-    spread = float(np.quantile(grey, 0.95) - np.quantile(grey, 0.05))
-    bright = float(np.quantile(grey, 0.95))
-    if bright < _DARK_GREY and seen_size(grey) is None:
-        return f"too dark: 95 % of the image is below grey {bright:.0f} of 255"
-    if spread < _CONTRAST_GREY:
-        return f"no contrast: 90 % of the image lies within {spread:.0f} of 255 grey levels"
-    size = seen_size(grey)
-    if size is None:
-        return "no chessboard pattern to be seen"
+def _why_nothing(grey: ByteArray) -> str:
+    low, high = (float(level) for level in np.quantile(grey, (0.05, 0.95)))
+    if high < _DARK_GREY:
+        return f"too dark: 95 % of the image is below grey {high:.0f} of 255"
+    if high - low < _CONTRAST_GREY:
+        return f"no contrast: 90 % of the image lies within {high - low:.0f} of 255 grey levels"
+    return "no chessboard pattern to be seen"
+
+
+def _why_not_this(target: Chessboard, size: tuple[int, int]) -> str:
     wanted = max(target.columns, target.rows), min(target.columns, target.rows)
     if size == wanted:
         return "the board's corners are too blurred or covered to be numbered"

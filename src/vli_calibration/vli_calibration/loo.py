@@ -36,9 +36,7 @@ def leave_one_out(lens: Lens, state: BundleState, observations: Sequence[Observa
 
     Weights are the fit's own: a corner it left out does not count here either.
     """
-    views = [
-        normal_equations(lens, state.parameters, pose, seen) for seen, pose in zip(observations, state.poses, strict=True)
-    ]
+    views = [normal_equations(lens, state.parameters, pose, seen) for seen, pose in zip(observations, state.poses, strict=True)]
     total = np.sum([view.reduced for view in views], axis=0)
     without = np.array([state.parameters + scaled_inverse(total - view.reduced) @ view.gradient for view in views])
     count = len(views)
