@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from vli_calibration.lens import Lens
-from vli_common.arrays import FloatArray
+from vli_common.arrays import FloatArray, IntArray
 
 _ITERATIONS = 60
 _CONVERGED = 1e-9
@@ -91,7 +91,7 @@ def normal_equations(
     by_pose, by_parameters = by_pose * root[:, None], by_parameters * root[:, None]
     block = by_pose.T @ by_pose
     coupling = by_pose.T @ by_parameters
-    inverse = np.linalg.pinv(block + np.diag(damping * block.diagonal()), hermitian=True)
+    inverse = np.asarray(np.linalg.pinv(block + np.diag(damping * block.diagonal()), hermitian=True), dtype=np.float64)
     pose_gradient = by_pose.T @ error
     return NormalEquations(
         by_parameters.T @ by_parameters - coupling.T @ inverse @ coupling,
@@ -130,7 +130,7 @@ def solve(
 
 
 def _improve(
-    lens: Lens, state: BundleState, observations: Sequence[Observation], free: np.ndarray, damping: float, cost: float
+    lens: Lens, state: BundleState, observations: Sequence[Observation], free: IntArray, damping: float, cost: float
 ) -> tuple[BundleState | None, float, float]:
     """Return the next estimate, damping and cost; None where no step lowers the cost."""
     while damping < _DAMPING_MOST:

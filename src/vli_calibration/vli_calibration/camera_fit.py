@@ -98,7 +98,7 @@ class CameraFit:
         return LENSES[self.model].parameters
 
     @property
-    def T_cam_board(self) -> dict[str, FloatArray]:
+    def T_cam_board(self) -> dict[str, FloatArray]:  # noqa: N802 (the field's notation)
         """Pose (4, 4) of the board by name of the view."""
         return {view.name: view.T_cam_board for view in self.views}
 
@@ -180,7 +180,8 @@ def fit_camera(views: Sequence[View], target: Target, resolution: tuple[int, int
     state = starting_state(lens, observations, resolution)
     if state is None:
         raise InputError(
-            f"no camera of model '{model}' sees the board '{target.spec}' like this; check that --target describes the printed one"
+            f"no camera of model '{model}' sees the board '{target.spec}' like this; "
+            "check that --target describes the printed one"
         )
     everything = [np.ones(len(view.detection), dtype=bool) for view in usable]
     problem = _Problem(lens, usable, observations, state, everything, np.ones(len(usable)))
@@ -252,7 +253,8 @@ def _check_count(views: Sequence[View], rejected: Sequence[Rejection]) -> None:
     if len(views) < LEAST_VIEWS:
         lost = f" ({len(rejected)} rejected: {rejected[-1].name} is {rejected[-1].reason})" if rejected else ""
         raise InputError(
-            f"the board is found in '{len(views)}' views{lost}, expected {LEAST_VIEWS} or more, better 20, at different tilts and distances"
+            f"the board is found in '{len(views)}' views{lost}, expected {LEAST_VIEWS} or more, better 20, "
+            "at different tilts and distances"
         )
 
 
@@ -260,8 +262,8 @@ def _check_tilts(problem: _Problem) -> None:
     span = tilt_span_deg([pose_matrix(pose) for pose in problem.state.poses])
     if span < PARALLEL_DEG:
         raise InputError(
-            f"all {len(problem.views)} views are parallel (tilts within '{span:.1f}' degrees), which leaves the focal length open; "
-            "take views tilted by 20 to 45 degrees about both axes"
+            f"all {len(problem.views)} views are parallel (tilts within '{span:.1f}' degrees), "
+            "which leaves the focal length open; take views tilted by 20 to 45 degrees about both axes"
         )
 
 

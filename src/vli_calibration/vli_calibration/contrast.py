@@ -31,4 +31,4 @@ def flattened(grey: ByteArray) -> ByteArray:
     """Return the image (H, W) divided by the light round about: glare, the laser's glow and the lamp's fall-off leave."""
     image = grey.astype(np.float32) + _BLACK_GREY
     light = cv2.GaussianBlur(image, (0, 0), max(grey.shape) * _LIGHT_OF_SIDE)
-    return np.clip(_MIDDLE_GREY * image / light, 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(_MIDDLE_GREY * image / light, 0, 255), dtype=np.uint8)

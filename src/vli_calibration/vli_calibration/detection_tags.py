@@ -11,7 +11,7 @@ from vli_calibration.boards import APRILTAG_BORDER_CELLS, AprilGrid, CharucoBoar
 from vli_calibration.contrast import equalised, scaled
 from vli_calibration.subpixel import board_grey, nearest_neighbour_px, refine
 from vli_calibration.types import Detection
-from vli_common.arrays import BoolArray, ByteArray, FloatArray, IntArray
+from vli_common.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray
 
 _KALIBR_TURN = 2
 """OpenCV's corner j of a tag as Kalibr prints it is the printed corner (j + 2) % 4."""
@@ -33,7 +33,7 @@ def detect_aprilgrid(target: AprilGrid, pixels: ByteArray) -> Detection | str:
         pixels: (H, W, 3) BGR or (H, W) grey.
     """
     grey = board_grey(pixels)
-    ids, corners = _most_tags(grey)
+    ids, corners = _most_tags(grey, target.columns * target.rows)
     if not len(ids):
         return "no tag of the family 36h11 to be seen"
     known = ids < target.columns * target.rows
@@ -83,14 +83,16 @@ def _attempts(grey: ByteArray) -> Iterator[tuple[ByteArray, float]]:
     yield equalised(scaled(grey, factor)), factor
 
 
-def _most_tags(grey: ByteArray) -> tuple[IntArray, FloatArray]:
-    """Return ids (T,) and corners (T, 4, 2) of the attempt that saw most, each id once."""
+def _most_tags(grey: ByteArray, enough: int) -> tuple[IntArray, FloatArray]:
+    """Return ids (T,) and corners (T, 4, 2) of the attempt that saw most, each id once; ``enough`` ends the search."""
     best_ids, best = np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2))
     for border in _BORDERS:
         detector = _tag_detector(border)
         for image, scale in _attempts(grey):
+            if len(best_ids) >= enough:
+                break
             found, ids, _ = detector.detectMarkers(image)
-            if ids is None:
+            if not found:
                 continue
             unique, first = np.unique(ids.ravel(), return_index=True)
             if len(unique) > len(best_ids):
@@ -141,7 +143,7 @@ def _places(target: AprilGrid, ids: IntArray) -> FloatArray:
     return target.points[(4 * ids[:, None] + np.arange(4)).ravel(), :2].reshape(-1, 4, 2) / target.tag
 
 
-def _misses(H: FloatArray, places: FloatArray, pixels: FloatArray) -> FloatArray:
+def _misses(H: AnyArray, places: FloatArray, pixels: FloatArray) -> FloatArray:
     predicted = cv2.perspectiveTransform(places.reshape(-1, 1, 2), H).reshape(-1, 2)
     lengths: FloatArray = np.linalg.norm(predicted - pixels.reshape(-1, 2), axis=1)
     return lengths
@@ -155,6 +157,8 @@ def _most_charuco(target: CharucoBoard, grey: ByteArray) -> tuple[FloatArray, In
         board.setLegacyPattern(legacy)
         detector = cv2.aruco.CharucoDetector(board)
         for image, scale in _attempts(grey):
+            if len(rows) == len(target.points):
+                break
             found, ids, _, marker_ids = detector.detectBoard(image)
             markers = max(markers, 0 if marker_ids is None else len(marker_ids))
             if ids is not None and len(ids) > len(rows):

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from vli_common.arrays import FloatArray
+from vli_common.arrays import AnyArray, FloatArray
 from vli_common.camera import CameraModel, make_camera
 
 PARAMETERS = ("fx", "fy", "cx", "cy")
@@ -36,7 +36,7 @@ class Lens:
         return PARAMETERS + self.coefficients
 
     def project(self, points: FloatArray, pose: FloatArray, parameters: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return pixels (N, 2) and their derivatives by pose (2N, 6) and parameters (2N, P), rows u0 v0 u1 …
+        """Return pixels (N, 2) and their derivatives by pose (2N, 6) and parameters (2N, P), rows u0 v0 u1 and so on.
 
         Args:
             points: (N, 3) in the board frame.
@@ -56,14 +56,18 @@ def _matrix(parameters: FloatArray) -> FloatArray:
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
 
 
+def _float(values: AnyArray) -> FloatArray:
+    return np.asarray(values, dtype=np.float64)
+
+
 def _radtan(points: FloatArray, pose: FloatArray, parameters: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     pixels, jacobian = cv2.projectPoints(points, pose[:3], pose[3:], _matrix(parameters), parameters[4:])
-    return pixels.reshape(-1, 2), jacobian[:, :6], jacobian[:, 6 : 6 + len(parameters)]
+    return _float(pixels).reshape(-1, 2), _float(jacobian[:, :6]), _float(jacobian[:, 6 : 6 + len(parameters)])
 
 
 def _equidistant(points: FloatArray, pose: FloatArray, parameters: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     pixels, jacobian = cv2.fisheye.projectPoints(points[:, None], pose[:3], pose[3:], _matrix(parameters), parameters[4:])
-    return pixels.reshape(-1, 2), jacobian[:, 8:14], jacobian[:, :8]
+    return _float(pixels).reshape(-1, 2), _float(jacobian[:, 8:14]), _float(jacobian[:, :8])
 
 
 LENSES: dict[str, Lens] = {

@@ -33,8 +33,8 @@ def robust_weights(error: FloatArray, sigma: float | None = None) -> FloatArray:
 def kept_corners(errors: Sequence[FloatArray]) -> list[BoolArray]:
     """Return, for each view, which of its residuals (K, 2) stay within :data:`REJECT_SIGMAS`.
 
-    The scale is each view's own, so that a blurred view loses no more than a sharp one, but not beyond one and a half times that of all: what
-    is worse is no blur.
+    The scale is each view's own, so that a blurred view loses no more than a sharp one, but not beyond one and a half times
+    that of all: what is worse is no blur.
     """
     lengths = [np.linalg.norm(error, axis=1) for error in errors]
     common = axis_sigma(np.concatenate(lengths))

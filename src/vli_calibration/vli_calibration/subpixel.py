@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from vli_common.arrays import BoolArray, ByteArray, FloatArray, Float32Array
+from vli_common.arrays import BoolArray, ByteArray, FloatArray
 
 _WINDOW_OF_SIDE = 0.3
 """Half the search window over the distance to the nearest corner: enough edge, and stripes further off do no harm."""
@@ -53,7 +53,7 @@ def refine(grey: ByteArray, corners: FloatArray, neighbour_px: FloatArray) -> tu
         corners: (N, 2) pixels, right to a fraction of a square.
         neighbour_px: (N,) distance to the nearest other corner, pixels.
     """
-    smooth: Float32Array = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), _BLUR_PX)
+    smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), _BLUR_PX)
     half = np.clip(np.rint(_WINDOW_OF_SIDE * neighbour_px), *_WINDOW_PX).astype(int)
     refined = corners.astype(np.float32)
     for size in np.unique(half):
