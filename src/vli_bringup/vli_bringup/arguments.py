@@ -1,4 +1,4 @@
-"""Arguments that ``vli run`` and ``vli replay`` share."""
+"""Arguments that ``vli run``, ``vli replay`` and ``vli doctor`` share."""
 
 from __future__ import annotations
 
@@ -17,13 +17,18 @@ def add_scan_arguments(parser: argparse.ArgumentParser) -> None:
     """Add bag, calibration, output, mode, parameters and the choice of topics and time."""
     parser.add_argument("bag", metavar="BAG", type=Path, help="rosbag2 directory or bare .mcap")
     parser.add_argument("--calib", metavar="C", type=Path, required=True, help="calibration file")
-    parser.add_argument("--imu-calib", metavar="F", type=Path, help="Kalibr's separate IMU file")
     parser.add_argument("--out", metavar="DIR", type=Path, help="results (default: results/STAMP, and the link results/latest)")
     parser.add_argument("--overwrite", action="store_true", help="replace the results in DIR")
     modes = [mode.value for mode in Mode]
     parser.add_argument(
         "--mode", choices=modes, default=modes[0], help="all | no window-to-map | no laser | no IMU (default: %(default)s)"
     )
+    add_source_arguments(parser)
+
+
+def add_source_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add Kalibr's IMU file, parameters, and the choice of topics and time."""
+    parser.add_argument("--imu-calib", metavar="F", type=Path, help="Kalibr's separate IMU file")
     parser.add_argument("--config", metavar="F", type=Path, help="parameters, in the form of config/vli.yaml")
     parser.add_argument("--set", metavar="STAGE.KEY=VALUE", action="append", default=[], help="one parameter; may be repeated")
     parser.add_argument("--start", metavar="S", type=_seconds, default=0.0, help="skip the first S seconds")
@@ -33,7 +38,7 @@ def add_scan_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def scan_settings(args: argparse.Namespace) -> Settings:
+def source_settings(args: argparse.Namespace) -> Settings:
     """Return the settings that ``--config``, ``--set`` and ``--topic`` ask for, the later ones first in rank.
 
     Raises:

@@ -19,6 +19,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "replay": ("vli_bringup.replay", "a bag through the node graph, at the bag's pace"),
     "simulate": ("vli_simulation.cli", "make a bag with truth"),
     "calibrate": ("vli_calibration.cli", "camera, laser plane, IMU: make a calibration and say what it is worth"),
+    "doctor": ("vli_bringup.doctor", "is a bag, or a live sensor, fit for a scan? say what to change"),
     "eval": ("vli_bringup.evaluation", "compare the output of run or replay with the truth"),
 }
 """Name → module with ``add_arguments(parser)`` and ``run(args) -> int``, and the line in ``vli --help``."""

@@ -12,7 +12,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from vli_bringup.arguments import add_scan_arguments, bag_topics, scan_settings
+from vli_bringup.arguments import add_scan_arguments, bag_topics, source_settings
 from vli_bringup.graph import SCANNER, STAGES, Playback, describe_graph
 from vli_bringup.input_checks import check_input
 from vli_bringup.listener import LISTENER, GraphListener
@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
         VliError: nothing usable: bag, calibration, parameters, output directory, or a node that failed.
     """
     mode = Mode(args.mode)
-    settings = scan_settings(args)
+    settings = source_settings(args)
     calibration = load_calibration(args.calib, mode, args.imu_calib)
     warnings = check_input(BagReader(args.bag, bag_topics(settings, mode)), calibration, mode.uses_imu)
     playback = Playback(args.bag, args.rate, args.start, args.duration)

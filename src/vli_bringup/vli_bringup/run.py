@@ -12,7 +12,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from vli_bringup.arguments import add_scan_arguments, bag_topics, scan_settings
+from vli_bringup.arguments import add_scan_arguments, bag_topics, source_settings
 from vli_bringup.input_checks import check_input
 from vli_bringup.output import SUMMARY, ResultsDirectory
 from vli_bringup.pipeline import Pipeline, Stages
@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> int:
         VliError: nothing usable: bag, calibration, parameters or output directory.
     """
     mode = Mode(args.mode)
-    settings = scan_settings(args)
+    settings = source_settings(args)
     calibration = load_calibration(args.calib, mode, args.imu_calib)
     topics = bag_topics(settings, mode)
     warnings = check_input(BagReader(args.bag, topics), calibration, mode.uses_imu)

@@ -1,0 +1,116 @@
+"""What a running sensor and running nodes send, for a few seconds."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+
+from vli_bringup.diagnosis.findings import Finding, Level
+from vli_common.errors import MessageError
+from vli_common.messages import encoded_from_message, imu_from_message, status_from_message
+from vli_common.node.transport import message_type, quality, set_transport_profile
+from vli_common.status import Health, StageStatus
+from vli_common.topics import IMAGE_RAW, IMAGE_RAW_COMPRESSED, IMU, NAMESPACE, STATUS, Topic
+from vli_common.types import EncodedImage, ImuSample
+from vli_driver.config import DriverConfig
+
+_DEPTH = 500
+
+
+@dataclass
+class Heard:
+    """What came: images and IMU samples by their stamps, and what is to be said of topics and nodes."""
+
+    items: list[EncodedImage | ImuSample] = field(default_factory=list)
+    findings: list[Finding] = field(default_factory=list)
+    statuses: dict[str, StageStatus] = field(default_factory=dict)
+
+
+def listen(config: DriverConfig, seconds: float) -> Heard:
+    """Collect for some seconds what camera, IMU and nodes send."""
+    set_transport_profile()
+    rclpy.init(signal_handler_options=rclpy.SignalHandlerOptions.NO)
+    try:
+        node = rclpy.create_node("doctor", namespace=NAMESPACE)
+        return _collect(node, config, seconds)
+    finally:
+        rclpy.try_shutdown()
+
+
+def _collect(node: Node, config: DriverConfig, seconds: float) -> Heard:
+    heard = Heard()
+    image = config.image_topic.removesuffix("/compressed")
+    cameras = {image: IMAGE_RAW, f"{image}/compressed": IMAGE_RAW_COMPRESSED}
+    for name, topic in cameras.items():
+        _subscribe(node, name, topic, lambda message: heard.items.append(encoded_from_message(message)), heard)
+    _subscribe(node, config.imu_topic, IMU, lambda message: heard.items.append(imu_from_message(message)), heard)
+    node.create_subscription(message_type(STATUS), STATUS.name, lambda message: _note(message, heard), quality(STATUS))
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    end_s = time.monotonic() + seconds
+    while (left_s := end_s - time.monotonic()) > 0:
+        executor.spin_once(min(left_s, 0.1))
+    heard.findings += _topic_findings(node, list(cameras), config.imu_topic)
+    heard.findings += [_status_finding(status) for _, status in sorted(heard.statuses.items())]
+    executor.shutdown(timeout_sec=0)
+    node.destroy_node()
+    heard.items.sort(key=lambda item: item.stamp_ns)
+    return heard
+
+
+def _subscribe(node: Node, name: str, topic: Topic, take: Callable[[Any], None], heard: Heard) -> None:
+    """Subscribe so that any publisher matches: best effort, volatile."""
+
+    def handle(message: Any) -> None:
+        try:
+            take(message)
+        except MessageError as error:
+            heard.findings.append(Finding(Level.WARNING, name, f"malformed message: {error}"))
+
+    profile = QoSProfile(
+        depth=_DEPTH,
+        history=HistoryPolicy.KEEP_LAST,
+        reliability=ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.VOLATILE,
+    )
+    node.create_subscription(message_type(topic), name, handle, profile)
+
+
+def _topic_findings(node: Node, cameras: list[str], imu: str) -> list[Finding]:
+    """Say which topics have no publisher, and where one publishes as best effort: such a one may lose frames."""
+    publishers = {name: node.get_publishers_info_by_topic(name) for name in (*cameras, imu)}
+    findings = []
+    if not any(publishers[name] for name in cameras):
+        text = f"nobody publishes '{cameras[0]}' or '{cameras[1]}'; start the driver, or name the topic with --topic image=/x"
+        findings.append(Finding(Level.PROBLEM, "camera", text))
+    if not publishers[imu]:
+        text = f"nobody publishes '{imu}'; start the driver, or name the topic with --topic imu=/x"
+        findings.append(Finding(Level.PROBLEM, "IMU", text))
+    for name, found in publishers.items():
+        lossy = [item.node_name for item in found if item.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT]
+        if lossy:
+            text = (
+                f"'{name}' is published as best effort by {', '.join(lossy)}; the nodes ask for reliable and would hear nothing"
+            )
+            findings.append(Finding(Level.PROBLEM, "topics", text))
+    return findings
+
+
+def _note(message: Any, heard: Heard) -> None:
+    try:
+        status = status_from_message(message)
+    except MessageError:
+        return
+    heard.statuses[status.node] = status
+
+
+def _status_finding(status: StageStatus) -> Finding:
+    levels = {Health.OK: Level.GOOD, Health.WARN: Level.WARNING, Health.ERROR: Level.PROBLEM, Health.STALE: Level.WARNING}
+    return Finding(levels[status.health], status.node, status.hint or status.state.value)
