@@ -6,6 +6,7 @@ import argparse
 import importlib
 
 COMMANDS: dict[str, tuple[str, str]] = {
+    "camera": ("camera", "intrinsics and lens distortion from images of a flat target"),
     "imu": ("imu", "noise densities and random walks of an IMU from hours at rest"),
 }
 """Name → module in :mod:`vli_calibration.commands` with ``add_arguments(parser)`` and ``run(args) -> int``, and its help."""
