@@ -4,7 +4,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from vli_common.config import parameter
+from vli_common.config import parameter, section
+
+
+@dataclass(frozen=True)
+class SceneConfig:
+    """Distances of the scene, from which every default that is a depth follows."""
+
+    near_m: float = parameter(
+        0.0, unit="m", minimum=0.0, maximum=1000.0, doc="nearest surface; 0: that of laser0.range_m, else 0.02"
+    )
+    far_m: float = parameter(
+        0.0, unit="m", minimum=0.0, maximum=1000.0, doc="farthest surface; 0: that of laser0.range_m, else 0.15"
+    )
 
 
 @dataclass(frozen=True)
@@ -82,7 +94,14 @@ class BackEndConfig:
     start_rest_s: float = parameter(0.4, unit="s", minimum=0.05, maximum=10.0, doc="rest needed for a start at rest")
     start_parallax_px: float = parameter(20.0, unit="px", minimum=1.0, maximum=500.0, doc="parallax needed for a start in motion")
     start_min_keyframes: int = parameter(4, unit="keyframes", minimum=3, maximum=8, doc="keyframes needed for a start in motion")
+    start_scale_sigma: float = parameter(
+        0.03,
+        minimum=0.001,
+        maximum=1.0,
+        doc="a start without laser waits until the IMU knows the scale this well, relative; lower: starts later, truer",
+    )
     min_landmarks: int = parameter(
         12, unit="features", minimum=5, maximum=200, doc="fewer in a frame: DEGRADED, the IMU carries it"
     )
     lost_after_s: float = parameter(0.7, unit="s", minimum=0.05, maximum=10.0, doc="DEGRADED for longer is LOST")
+    scene: SceneConfig = section(SceneConfig)

@@ -10,6 +10,7 @@ import numpy as np
 
 from vli_backend.condense import Quadratic, condense, refine
 from vli_backend.config import BackEndConfig
+from vli_backend.depth_prior import DepthPrior
 from vli_backend.frame_pose import FramePose, solve_frame_pose
 from vli_backend.landmarks import LandmarkTable
 from vli_backend.laser_depth import measure_slot
@@ -54,6 +55,7 @@ class WindowEstimator:
         state: its state.
         prior: how well that is known.
         scans: stripes seen so far.
+        depths: where surfaces may be.
     """
 
     def __init__(
@@ -64,15 +66,17 @@ class WindowEstimator:
         state: KeyframeState,
         prior: StatePrior,
         scans: list[LaserScan],
+        depths: DepthPrior,
     ) -> None:
         self._config = config
         self._focal_px = calibration.camera.focal_px
         self._T_cam_imu = calibration.T_cam_imu if calibration.T_cam_imu is not None else np.eye(4)
         self._T_imu_cam = inverse(self._T_cam_imu)
-        self._limits = _inverse_depth_limits(calibration)
-        self._largest_jump = _range_m(calibration)[0]
+        self._depths = depths
+        self._limits = depths.inverse_limits
+        self._largest_jump = depths.near
         self._smoother: Smoother = GtsamSmoother(config.window_keyframes)
-        self._landmarks = LandmarkTable(config.window_keyframes + 1)
+        self._landmarks = LandmarkTable(config.window_keyframes + 1, depths.spread)
         self._window = Window()
         self._scans = list(scans)
         self._restarted: set[int] = set()
@@ -141,8 +145,10 @@ class WindowEstimator:
         self._append_keyframe(tracks, state, imu)
         self._state = state
 
-    def finish_start(self) -> None:
-        """Solve the window of a start in motion."""
+    def finish_start(self, scale_sigma: float | None = None) -> None:
+        """Solve the window of a start in motion; ``scale_sigma``: how well its scale is known, relative, where no laser tells."""
+        if scale_sigma is not None:
+            self._smoother.hold_scale(scale_sigma)
         self._solve(self._config.start_iterations)
         self._records = [
             FrameRecord(self._window.stamps[-1], self._state.T_map_imu @ self._T_imu_cam, self._window.stationary[-1])
@@ -237,7 +243,7 @@ class WindowEstimator:
         self._restarted.clear()
 
     def _depth_guess(self) -> float:
-        """Return the inverse depth of a new landmark: the median of the newest scan, else of the landmarks, else mid-range."""
+        """Return a new landmark's inverse depth: the median of the newest scan, else of the landmarks, else the prior's."""
         scan = self._scans[-1] if self._scans else None
         if scan is None:
             found = [list(i.scans.values())[-1] for i in self._window.intervals if i.scans]
@@ -245,7 +251,7 @@ class WindowEstimator:
         if scan is not None and len(scan):
             return float(1.0 / np.median(scan.points[:, 2]))
         known = self._landmarks.arrays.rho[self._landmarks.usable]
-        return float(np.median(known)) if len(known) >= 5 else float(np.sqrt(self._limits[0] * self._limits[1]))
+        return float(np.median(known)) if len(known) >= 5 else 1.0 / self._depths.first
 
     def _solve(self, iterations: int) -> None:
         """Find depths, then poses, velocities and biases of the window."""
@@ -339,14 +345,3 @@ class WindowEstimator:
             covariance,
             session,
         )
-
-
-def _range_m(calibration: Calibration) -> tuple[float, float]:
-    """Return the nearest and the farthest surface, metres."""
-    return calibration.laser.range_m if calibration.laser is not None else (0.02, 0.15)
-
-
-def _inverse_depth_limits(calibration: Calibration) -> tuple[float, float]:
-    """Return the inverse depths (1/m) that a landmark may have: the scanner's range, generously."""
-    near, far = _range_m(calibration)
-    return 0.3 / far, 3.0 / near

@@ -18,9 +18,6 @@ from vli_common.arrays import AnyArray, BoolArray, FloatArray, IntArray
 KEPT_OBSERVATIONS = 4
 """Newest slots whose observations continue as a new landmark when the anchor leaves."""
 
-_PRIOR_SPREAD = 0.5
-"""First guess of an inverse depth: one standard deviation, relative."""
-
 
 @dataclass(frozen=True)
 class LandmarkPoints:
@@ -36,10 +33,12 @@ class LandmarkTable:
 
     Args:
         slots: most keyframes in the window at any time.
+        spread: of the first guess of an inverse depth: one standard deviation, relative.
     """
 
-    def __init__(self, slots: int) -> None:
+    def __init__(self, slots: int, spread: float = 0.5) -> None:
         self.slots = slots
+        self._spread = spread
         self.frames = 0
         self.ids: IntArray = np.empty(0, np.int64)
         self.active: BoolArray = np.empty(0, np.bool_)
@@ -184,7 +183,7 @@ class LandmarkTable:
         arrays.anchor = np.concatenate([arrays.anchor, np.broadcast_to(np.asarray(anchors, np.int64), count)])
         arrays.anchor_ray = np.concatenate([arrays.anchor_ray, rays])
         arrays.rho = np.concatenate([arrays.rho, rho])
-        arrays.prior = np.concatenate([arrays.prior, np.stack([rho, _PRIOR_SPREAD * rho], axis=1)])
+        arrays.prior = np.concatenate([arrays.prior, np.stack([rho, self._spread * rho], axis=1)])
         arrays.rays = np.concatenate([arrays.rays, np.zeros((count, self.slots, 2))])
         for name in ("sigma", "depth", "depth_sigma"):
             setattr(arrays, name, np.concatenate([getattr(arrays, name), np.zeros((count, self.slots))]))

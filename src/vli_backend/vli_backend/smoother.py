@@ -74,6 +74,9 @@ class Smoother(Protocol):
     def add_keyframe(self, state: KeyframeState, imu: gtsam.PreintegratedCombinedMeasurements | None, elapsed_s: float) -> None:
         """Append a keyframe with its first guess; without ``imu`` only the biases are linked to the last keyframe."""
 
+    def hold_scale(self, relative_sigma: float) -> None:
+        """Tie the largest distance between two keyframes of the window to what it is now, with a relative sigma."""
+
     def solve(self, condenser: Condenser, iterations: int) -> int:
         """Iterate to convergence; return the iterations used."""
 
@@ -143,6 +146,14 @@ class GtsamSmoother:
         self._new_stamps |= {key: float(last) for key in (X(last), V(last), B(last))}
         self._new_stamps |= {key: float(last) for key in (X(new), V(new), B(new))}
         self._count += 1
+
+    def hold_scale(self, relative_sigma: float) -> None:
+        """See :meth:`Smoother.hold_scale`."""
+        positions = self._poses()[:, :3, 3]
+        distances = np.linalg.norm(positions[:, None] - positions, axis=2)
+        i, j = np.unravel_index(int(np.argmax(distances)), distances.shape)
+        noise = gtsam.noiseModel.Isotropic.Sigma(1, relative_sigma * float(distances[i, j]))
+        self._new_factors.add(gtsam.RangeFactorPose3(X(self._first + i), X(self._first + j), float(distances[i, j]), noise))
 
     def solve(self, condenser: Condenser, iterations: int) -> int:
         """See :meth:`Smoother.solve`."""

@@ -8,10 +8,12 @@ import gtsam
 import numpy as np
 
 from vli_backend.config import BackEndConfig
+from vli_backend.depth_prior import DepthPrior
 from vli_backend.estimator import WindowEstimator
 from vli_backend.initialisation import GRAVITY, align_imu, apply_alignment, rest_state
 from vli_backend.motion_start import structure_from_motion
 from vli_backend.smoother import KeyframeState, StatePrior
+from vli_backend.visual_start import start_from_vision
 from vli_common.arrays import FloatArray
 from vli_common.calibration import Calibration
 from vli_common.geometry import so3_log
@@ -19,6 +21,8 @@ from vli_common.types import FrontEndOutput, LaserScan, Mode, Preintegration, Tr
 
 _SCAN_MEMORY_NS = 4_000_000_000
 _MIN_FEATURES = 15
+_VISUAL_WINDOWS = 3
+"""Window lengths over which a start without laser compares images and IMU: the longer, the better it knows the scale."""
 
 
 class Starter:
@@ -37,7 +41,9 @@ class Starter:
         self._calibration = calibration
         self._config = config
         self._mode = mode
+        self._depths = DepthPrior.of_scene(calibration, config)
         self._keyframes: list[FrontEndOutput] = []
+        self._between: list[list[FrontEndOutput]] = []
         self._scans: list[LaserScan] = []
         self._moved = False
         self.reason = "waiting for the first keyframe"
@@ -56,21 +62,35 @@ class Starter:
             T_map_imu: (4, 4) where to start: position and heading of the new window.
         """
         tracks = frame.tracks
-        if tracks.keyframe:
-            if self._keyframes and not self._connected(frame):
-                self._keyframes.clear()
-            self._keyframes.append(frame)
-            self._moved = not tracks.stationary
-            del self._keyframes[: -self._config.window_keyframes]
+        self._keep(frame)
         self._moved |= not tracks.stationary
         if problem := self._missing(tracks):
             self.reason = problem
             return None
+        if self._mode is Mode.VI:
+            return self._start_from_vision(T_map_imu) if tracks.keyframe else None
         if not self._moved or not self._mode.uses_imu:
             return self._start_at_rest(frame, T_map_imu)
         if tracks.keyframe:
             return self._start_in_motion(T_map_imu)
         return None
+
+    def _keep(self, frame: FrontEndOutput) -> None:
+        """Store a keyframe, and without the laser every frame: the IMU is compared with all of them."""
+        if not frame.tracks.keyframe:
+            if self._mode is Mode.VI and self._between and frame.preintegration is not None:
+                self._between[-1].append(frame)
+            return
+        if self._keyframes and not self._connected(frame):
+            self._keyframes.clear()
+            self._between.clear()
+        if self._between:
+            self._between[-1].append(frame)
+        self._keyframes.append(frame)
+        self._between.append([])
+        self._moved = not frame.tracks.stationary
+        longest = self._config.window_keyframes * (_VISUAL_WINDOWS if self._mode is Mode.VI else 1)
+        del self._keyframes[:-longest], self._between[:-longest]
 
     def _connected(self, frame: FrontEndOutput) -> bool:
         shared = np.intersect1d(frame.tracks.ids, self._keyframes[-1].tracks.ids)
@@ -120,10 +140,35 @@ class Starter:
         self.reason = "started in motion"
         return estimator
 
-    def _estimator(self, tracks: Tracks, state: KeyframeState, velocity_sigma: float) -> WindowEstimator:
+    def _start_from_vision(self, T_map_imu: FloatArray) -> WindowEstimator | None:
+        config = self._config
+        if len(self._keyframes) < config.start_min_keyframes:
+            self.reason = (
+                f"{len(self._keyframes)} of {config.start_min_keyframes} keyframes; without the laser the scale needs motion"
+            )
+            return None
+        intervals = self._between[:-1]
+        tracks = [frame.tracks for frame in self._keyframes]
+        found = start_from_vision(self._calibration, config, tracks[0], intervals, self._depths.first)
+        if found.problem:
+            self.reason = found.problem
+            return None
+        newest = slice(-config.window_keyframes, None)
+        tracks, states = tracks[newest], [_placed(state, T_map_imu) for state in found.states[newest]]
+        estimator = self._estimator(tracks[0], states[0], 0.1, self._depths.around(found.median_depth))
+        imu = [_measurements(frame.preintegration) for frame in self._keyframes[newest][1:]]
+        for track, state, pim in zip(tracks[1:], states[1:], imu, strict=True):
+            estimator.add_start_keyframe(track, state, pim)
+        estimator.finish_start(found.scale_sigma)
+        self.reason = f"started from vision and IMU, scale known to {100 * found.scale_sigma:.1f} %"
+        return estimator
+
+    def _estimator(
+        self, tracks: Tracks, state: KeyframeState, velocity_sigma: float, depths: DepthPrior | None = None
+    ) -> WindowEstimator:
         config = self._config
         prior = StatePrior(np.full(3, config.tilt_sigma), 1e-6, velocity_sigma, config.gyro_bias_sigma, config.accel_bias_sigma)
-        return WindowEstimator(self._calibration, config, tracks, state, prior, self._scans)
+        return WindowEstimator(self._calibration, config, tracks, state, prior, self._scans, depths or self._depths)
 
 
 def _placed(state: KeyframeState, T_map_imu: FloatArray) -> KeyframeState:

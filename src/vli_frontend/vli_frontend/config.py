@@ -70,6 +70,13 @@ class KeyframeConfig:
         maximum=500.0,
         doc="mean motion since the last keyframe, rotation taken out; larger: fewer keyframes",
     )
+    parallax_vi_px: float = parameter(
+        20.0,
+        unit="px at f = 460 px",
+        minimum=1.0,
+        maximum=500.0,
+        doc="the same without the laser: the scale is the IMU's, which knows the tremor of a hand from near keyframes only",
+    )
     min_tracks: int = parameter(
         40, unit="tracks", minimum=5, maximum=1000, doc="fewer in common with the last keyframe make a new one"
     )

@@ -37,7 +37,7 @@ class FrontEnd:
         self._synchroniser = Synchroniser(calibration.timeshift_ns, wait_ns, mode.uses_imu, self.counters)
         self._preintegrator = self._make_preintegrator() if mode.uses_imu else None
         self._tracker = Tracker(calibration.camera, config, self.counters)
-        self._keyframes = KeyframeRule(config.keyframe, calibration.camera.focal_px)
+        self._keyframes = KeyframeRule(config.keyframe, calibration.camera.focal_px, mode.uses_laser)
         # Long and short frames alternate: 1.5 frame periods reach the neighbour, and no farther one where the rhythm jitters.
         self._stripes = StripeDistance(round(1.5 * NANOSECONDS / calibration.rate_hz))
         self._session = 0

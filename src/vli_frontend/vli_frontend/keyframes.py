@@ -40,11 +40,12 @@ class KeyframeRule:
     Args:
         config: thresholds.
         focal_px: of the camera.
+        uses_laser: whether the laser gives the scale.
     """
 
-    def __init__(self, config: KeyframeConfig, focal_px: float) -> None:
+    def __init__(self, config: KeyframeConfig, focal_px: float, uses_laser: bool = True) -> None:
         self._config = config
-        self._parallax = config.parallax_px / _REFERENCE_FOCAL_PX
+        self._parallax = (config.parallax_px if uses_laser else config.parallax_vi_px) / _REFERENCE_FOCAL_PX
         self._rest_flow = config.rest_flow_px / focal_px
         self._motion_ns, self._rest_ns = seconds_to_ns(config.motion_s), seconds_to_ns(config.rest_s)
         self._last: _Keyframe | None = None

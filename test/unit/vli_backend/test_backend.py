@@ -88,6 +88,23 @@ def test_the_scanner_works_without_an_imu() -> None:
     assert scale < 1.0
 
 
+def test_without_the_laser_the_imu_gives_the_scale_once_the_motion_tells_it() -> None:
+    scan = Scan(Motion(tremor=4.0), pixel_noise=0.05)
+    _, outputs = _run(scan, 8.0, Mode.VI)
+    rmse, scale = _errors(scan, outputs, calibration())
+    assert rmse < 2.0
+    assert scale < 6.0
+    first = next(o for o in outputs if o.state is TrackingState.TRACKING)
+    assert "scale known to" in first.reason
+
+
+def test_without_the_laser_an_even_motion_does_not_start_and_says_why() -> None:
+    _, outputs = _run(Scan(Motion(tremor=0.0)), 4.0, Mode.VI)
+    assert all(o.pose is None for o in outputs)
+    assert "scale" in outputs[-1].reason
+    assert "move less evenly" in outputs[-1].reason
+
+
 def test_window_frames_turn_final_exactly_once_and_in_order() -> None:
     back_end, outputs = _run(Scan(), 5.0)
     final: list[int] = []
