@@ -88,5 +88,9 @@ def _listen(settings: Settings, calibration: Calibration | None, args: argparse.
     seconds = _LIVE_S if args.duration is None else args.duration
     sys.stderr.write(f"vli doctor: listening for {seconds:g} s\n")
     heard = listen(settings.driver, seconds)
-    checks: list[Check] = [CameraCheck(calibration, settings), ImuCheck(calibration, settings.driver.imu_topic)]
+    checks: list[Check] = []
+    if heard.has_camera:
+        checks.append(CameraCheck(calibration, settings))
+    if heard.has_imu:
+        checks.append(ImuCheck(calibration, settings.driver.imu_topic))
     return [*heard.findings, *diagnose(heard.items, checks)]

@@ -26,11 +26,16 @@ _DEPTH = 500
 
 @dataclass
 class Heard:
-    """What came: images and IMU samples by their stamps, and what is to be said of topics and nodes."""
+    """What came: images and IMU samples by their stamps, and what is to be said of topics and nodes.
+
+    ``has_camera`` and ``has_imu`` are False where nobody publishes, which is a finding already.
+    """
 
     items: list[EncodedImage | ImuSample] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)
     statuses: dict[str, StageStatus] = field(default_factory=dict)
+    has_camera: bool = True
+    has_imu: bool = True
 
 
 def listen(config: DriverConfig, seconds: float) -> Heard:
@@ -57,7 +62,10 @@ def _collect(node: Node, config: DriverConfig, seconds: float) -> Heard:
     end_s = time.monotonic() + seconds
     while (left_s := end_s - time.monotonic()) > 0:
         executor.spin_once(min(left_s, 0.1))
-    heard.findings += _topic_findings(node, list(cameras), config.imu_topic)
+    publishers = {name: node.get_publishers_info_by_topic(name) for name in (*cameras, config.imu_topic)}
+    heard.has_camera = any(publishers[name] for name in cameras)
+    heard.has_imu = bool(publishers[config.imu_topic])
+    heard.findings += _topic_findings(publishers, heard, image, config.imu_topic)
     heard.findings += [_status_finding(status) for _, status in sorted(heard.statuses.items())]
     executor.shutdown(timeout_sec=0)
     node.destroy_node()
@@ -83,14 +91,13 @@ def _subscribe(node: Node, name: str, topic: Topic, take: Callable[[Any], None],
     node.create_subscription(message_type(topic), name, handle, profile)
 
 
-def _topic_findings(node: Node, cameras: list[str], imu: str) -> list[Finding]:
+def _topic_findings(publishers: dict[str, list[Any]], heard: Heard, image: str, imu: str) -> list[Finding]:
     """Say which topics have no publisher, and where one publishes as best effort: such a one may lose frames."""
-    publishers = {name: node.get_publishers_info_by_topic(name) for name in (*cameras, imu)}
     findings = []
-    if not any(publishers[name] for name in cameras):
-        text = f"nobody publishes '{cameras[0]}' or '{cameras[1]}'; start the driver, or name the topic with --topic image=/x"
+    if not heard.has_camera:
+        text = f"nobody publishes '{image}' or '{image}/compressed'; start the driver, or name the topic with --topic image=/x"
         findings.append(Finding(Level.PROBLEM, "camera", text))
-    if not publishers[imu]:
+    if not heard.has_imu:
         text = f"nobody publishes '{imu}'; start the driver, or name the topic with --topic imu=/x"
         findings.append(Finding(Level.PROBLEM, "IMU", text))
     for name, found in publishers.items():
