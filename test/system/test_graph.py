@@ -149,6 +149,26 @@ def test_the_last_line_of_a_node_that_cannot_start_is_the_error_of_the_graph(tmp
                 time.sleep(0.1)
 
 
+def test_the_doctor_listens_to_a_running_sensor(tmp_path: Path, calibration: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["doctor", "--live", "--duration", "1"]) == 1
+    assert "nobody publishes '/imu'" in capsys.readouterr().out
+    bag = TinyBag(seconds=40.0).write(tmp_path / "bag")
+    driver = subprocess.Popen(command("driver_node", f"bag:={bag}"))
+    try:
+        deadline_s = time.monotonic() + _START_S
+        out = ""
+        while "IMU and camera overlap" not in out:
+            assert time.monotonic() < deadline_s, out
+            main(["doctor", "--live", "--duration", "2", "--calib", str(calibration)])
+            out = capsys.readouterr().out
+        assert "long and" in out
+        assert "driver_node" in out
+        assert "measures gravity in m/s²" in out
+    finally:
+        driver.terminate()
+        driver.wait(20)
+
+
 def test_replay_of_noise_passes_every_frame_and_says_that_tracking_never_started(
     tmp_path: Path, calibration: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
