@@ -18,22 +18,17 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from ground_truth import Truth
 
-from vli_bringup.tum import Trajectory, read_tum
 from vli_common.arrays import BoolArray, FloatArray
 from vli_common.calibration import Calibration, load_calibration
-from vli_common.geometry import inverse, transform
-from vli_common.ply import read_mesh
 from vli_common.types import Exposure, FrontEndOutput, Image, ImuSample, Mode, TrackFlag
 from vli_driver.bag import BagReader
 from vli_driver.decode import decode
 from vli_driver.demux import Demultiplexer
 from vli_frontend.config import FrontEndConfig
 from vli_frontend.frontend import FrontEnd
-from vli_frontend.patch_alignment import MARGIN_PX, RADIUS
 from vli_frontend.warm_up import warm_up
-from vli_simulation.caster import RayCaster
-from vli_simulation.mesh import Mesh
 
 DATA = Path(__file__).resolve().parents[3] / "shared/data/keyboard_short"
 AGES = (1, 10, 30)
@@ -43,54 +38,6 @@ TRACKERS = {
     "LK, normalised": replace(_RECIPE, klt=replace(_RECIPE.klt, alignment=False)),
     "recipe": _RECIPE,
 }
-_EDGE_SHARE = 0.02
-"""A patch whose depth departs from a plane by more than this share lies across a depth edge."""
-_HIDDEN_SHARE = 0.01
-
-
-@dataclass(frozen=True)
-class Truth:
-    """Poses of the camera, the surface, the camera model."""
-
-    trajectory: Trajectory
-    caster: RayCaster
-    calibration: Calibration
-
-    def pose(self, stamp_ns: int) -> FloatArray:
-        """Return T_world_camera (4, 4) at the nearest stamp of the truth."""
-        stamps = self.trajectory.stamps_ns
-        result: FloatArray = self.trajectory.poses[np.argmin(np.abs(stamps - stamp_ns))]
-        return result
-
-    def points(self, stamp_ns: int, rays: FloatArray) -> FloatArray:
-        """Return the surface points (N, 3), world, that rays (N, 2) see; NaN where none."""
-        T, depth = self.pose(stamp_ns), self.depth(stamp_ns, rays)
-        return transform(T, depth[:, None] * np.column_stack([rays, np.ones(len(rays))]))
-
-    def depth(self, stamp_ns: int, rays: FloatArray) -> FloatArray:
-        """Return the depth (N,) of rays (N, 2); NaN where nothing is hit."""
-        T = self.pose(stamp_ns)
-        hits = self.caster.cast(T[:3, 3], np.column_stack([rays, np.ones(len(rays))]) @ T[:3, :3].T)
-        return np.where(hits.triangle >= 0, hits.distance, np.nan).astype(np.float64)
-
-    def pixels(self, stamp_ns: int, points: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """Return raw pixels (N, 2) of points (N, 3) and whether they are seen: inside the image by a margin, not hidden."""
-        camera = self.calibration.camera
-        local = transform(inverse(self.pose(stamp_ns)), points)
-        pixels = camera.project(local)
-        inside = ((pixels >= MARGIN_PX) & (pixels <= [camera.width - 1 - MARGIN_PX, camera.height - 1 - MARGIN_PX])).all(axis=1)
-        depth = self.depth(stamp_ns, local[:, :2] / local[:, 2:])
-        return pixels, inside & (np.abs(depth - local[:, 2]) < _HIDDEN_SHARE * local[:, 2])
-
-    def on_edge(self, stamp_ns: int, pixels: FloatArray) -> BoolArray:
-        """Return (N,) True where the depth within the patch is no plane."""
-        v, u = (grid.ravel().astype(np.float64) for grid in np.mgrid[-RADIUS : RADIUS + 1 : 2, -RADIUS : RADIUS + 1 : 2])
-        around = (pixels[:, None] + np.stack([u, v], axis=1)).reshape(-1, 2)
-        inverse_depth = 1.0 / self.depth(stamp_ns, self.calibration.camera.unproject(around)).reshape(len(pixels), -1)
-        design = np.stack([u, v, np.ones_like(u)], axis=1)
-        fitted = np.nan_to_num(inverse_depth) @ np.linalg.pinv(design).T @ design.T
-        residual = np.abs(fitted / inverse_depth - 1.0).max(axis=1)
-        return ~(residual < _EDGE_SHARE)
 
 
 @dataclass(frozen=True)
@@ -100,13 +47,6 @@ class Track:
     birth: int
     pixels: FloatArray
     sigma: FloatArray
-
-
-def load_surface(path: Path) -> RayCaster:
-    """Return a surface to cast rays against; material and texture play no part."""
-    mesh = read_mesh(path)
-    none = np.zeros(len(mesh.faces), np.int64)
-    return RayCaster(Mesh(mesh.vertices, mesh.faces, none, none, np.zeros((len(mesh.vertices), 2))))
 
 
 def long_frames(directory: Path, calibration: Calibration, frames: int) -> Iterator[Image | ImuSample]:
@@ -213,7 +153,7 @@ def main() -> None:
     cv2.setNumThreads(1)
     warm_up()
     calibration = load_calibration(arguments.directory / "calibration.yaml")
-    truth = Truth(read_tum(arguments.directory / "truth.tum"), load_surface(arguments.directory / "surface.ply"), calibration)
+    truth = Truth.load(arguments.directory)
     items = list(long_frames(arguments.directory, calibration, arguments.frames))
     print("tracker          ms mean/p95   age ended % | lag %, scatter, p95 px, error/sigma, N: smooth | across depth edges")
     for name, config in TRACKERS.items():
