@@ -201,11 +201,11 @@ def brightened(pixels: ByteArray) -> ByteArray:
 def marked(pixels: ByteArray, view: FittedView) -> ByteArray:
     """Return the image with its corners, green kept, red left out."""
     picture = brightened(pixels)
-    picture = cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR) if picture.ndim == 2 else np.ascontiguousarray(picture[:, :, :3])
+    picture = np.dstack([picture] * 3) if picture.ndim == 2 else np.ascontiguousarray(picture[:, :, :3])
     radius = max(3, picture.shape[1] // 160)
     for (u, v), kept in zip(view.detection.pixels, view.kept, strict=True):
         cv2.circle(picture, (round(u), round(v)), radius, _GREEN if kept else _RED, max(1, radius // 3), cv2.LINE_AA)
-    return np.asarray(picture, dtype=np.uint8)
+    return picture
 
 
 def _split(views: Sequence[FittedView]) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
