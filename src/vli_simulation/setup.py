@@ -17,6 +17,7 @@ setup(
         ("share/vli_simulation", ["package.xml"]),
     ],
     install_requires=[
+        "vli_calibration==0.1.0",
         "vli_common==0.1.0",
         "embreex>=2.17.7",
         "numba>=0.59",

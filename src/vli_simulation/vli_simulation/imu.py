@@ -39,18 +39,28 @@ def record_imu(trajectory: Trajectory, config: ImuConfig, start_ns: int, duratio
     offsets_ns = np.round((np.arange(count) / config.rate_hz - _LEAD_S) * NANOSECONDS).astype(np.int64)
     state = trajectory.imu(offsets_ns / NANOSECONDS)
     force = np.einsum("nji,nj->ni", state.T_world_imu[:, :3, :3], state.acceleration + np.array([0.0, 0.0, GRAVITY]))
-    rng = np.random.default_rng([seed, 3])
+    return _measured(offsets_ns + start_ns, state.angular_velocity, force, config, np.random.default_rng([seed, 3]))
+
+
+def record_rest(config: ImuConfig, start_ns: int, duration_s: float, seed: int) -> ImuRecording:
+    """Return what the IMU measures while it lies still, in an attitude that is drawn from the seed."""
+    count = int(duration_s * config.rate_hz)
+    offsets_ns = np.round(np.arange(count) * (NANOSECONDS / config.rate_hz)).astype(np.int64)
+    rng = np.random.default_rng([seed, 20])
+    up = np.array([0.0, 0.0, 1.0]) + rng.normal(0, 0.1, 3)
+    force = np.broadcast_to(GRAVITY * up / np.linalg.norm(up), (count, 3))
+    return _measured(offsets_ns + start_ns, np.zeros((count, 3)), force, config, rng)
+
+
+def _measured(
+    stamps_ns: IntArray, rate: FloatArray, force: FloatArray, config: ImuConfig, rng: np.random.Generator
+) -> ImuRecording:
+    count = len(stamps_ns)
     gyro_bias = _bias(rng, count, config, config.gyroscope_bias, config.gyroscope_random_walk)
     accel_bias = _bias(rng, count, config, config.accelerometer_bias, config.accelerometer_random_walk)
     gyro_noise = _white(rng, count, config, config.gyroscope_noise_density)
     accel_noise = _white(rng, count, config, config.accelerometer_noise_density)
-    return ImuRecording(
-        offsets_ns + start_ns,
-        state.angular_velocity + gyro_bias + gyro_noise,
-        force + accel_bias + accel_noise,
-        gyro_bias,
-        accel_bias,
-    )
+    return ImuRecording(stamps_ns, rate + gyro_bias + gyro_noise, force + accel_bias + accel_noise, gyro_bias, accel_bias)
 
 
 def _bias(rng: np.random.Generator, count: int, config: ImuConfig, constant: float, walk: float) -> FloatArray:

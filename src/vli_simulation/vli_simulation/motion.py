@@ -17,9 +17,12 @@ from vli_common.geometry import inverse, pose, skew, so3_exp, so3_log
 from vli_simulation.config import MotionConfig, SimulationError
 from vli_simulation.rig import Rig
 
-_NODE_S = 0.01
-_MARGIN_S = 0.5
-_RAMP_S = 0.6
+NODE_S = 0.01
+"""Spacing of the samples that the spline goes through."""
+MARGIN_S = 0.5
+"""Samples before the first frame and after the last one."""
+RAMP_S = 0.6
+"""From rest to full motion."""
 _SWAY_HZ = (0.08, 0.6)
 _TREMOR_HZ = (4.0, 12.0)
 _SWAY_M = np.array([0.8e-3, 2.2e-3, 1.6e-3])
@@ -102,7 +105,7 @@ def plan_motion(config: MotionConfig, path: ScanPath, rig: Rig, stripe_angle_deg
         SimulationError: the passes are longer than the scene.
     """
     rng = np.random.default_rng([seed, 2])
-    times = np.arange(-_MARGIN_S, config.duration_s + _MARGIN_S + _NODE_S, _NODE_S)
+    times = np.arange(-MARGIN_S, config.duration_s + MARGIN_S + NODE_S, NODE_S)
     along, bounds = _progress(config, times)
     if (reach := float(np.ptp(along))) > path.length:
         raise SimulationError(
@@ -110,7 +113,7 @@ def plan_motion(config: MotionConfig, path: ScanPath, rig: Rig, stripe_angle_deg
             "more --passes or less --speed or --duration"
         )
     along = along + 0.5 * (path.length - reach)
-    envelope = _smooth_step((times - config.rest_s) / _RAMP_S) if config.rest_s > 0 else np.ones_like(times)
+    envelope = smooth_step((times - config.rest_s) / RAMP_S) if config.rest_s > 0 else np.ones_like(times)
     wander, turn = _hand(config, times, rng)
     R_world_cam = _camera_axes(path, np.deg2rad(stripe_angle_deg))
     lateral = np.cross(path.normal, path.direction)
@@ -126,29 +129,32 @@ def _progress(config: MotionConfig, times: FloatArray) -> tuple[FloatArray, list
     if moving <= 0:
         return np.zeros_like(times), [(0.0, config.duration_s)]
     turns = config.rest_s + moving * np.arange(config.passes + 1) / config.passes
-    velocity = _smooth_step((times - config.rest_s) / _RAMP_S) if config.rest_s > 0 else np.ones_like(times)
+    velocity = smooth_step((times - config.rest_s) / RAMP_S) if config.rest_s > 0 else np.ones_like(times)
     for index, turn in enumerate(turns[1:-1]):
-        velocity = velocity - 2 * (-1) ** index * _smooth_step((times - turn) / _RAMP_S + 0.5)
+        velocity = velocity - 2 * (-1) ** index * smooth_step((times - turn) / RAMP_S + 0.5)
     inside = (times >= 0) & (times <= config.duration_s)
-    mean = float(np.abs(velocity[inside]).sum() * _NODE_S / moving)
+    mean = float(np.abs(velocity[inside]).sum() * NODE_S / moving)
     velocity = velocity * config.speed / mean
-    along = np.concatenate([[0.0], np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * _NODE_S)])
+    along = np.concatenate([[0.0], np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * NODE_S)])
     starts = [0.0, *turns[1:]]
     return along - along[inside].min(), list(itertools.pairwise(starts))
 
 
 def _hand(config: MotionConfig, times: FloatArray, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     """Return wandering (N, 3) metres along, across, away from the surface; rotation vectors (N, 3) in the camera frame."""
-    sway = _oscillation(rng, times, _SWAY_HZ, 5) * config.sway
-    tremor = _oscillation(rng, times, _TREMOR_HZ, 8) * config.tremor
+    sway = oscillation(rng, times, _SWAY_HZ, 5) * config.sway
+    shake, shake_turn = hand_tremor(rng, times, config.tremor)
     reach = config.distance / 0.03
-    return (
-        reach * sway[:, :3] * _SWAY_M + tremor[:, :3] * _TREMOR_M,
-        sway[:, 3:] * _SWAY_RAD + tremor[:, 3:] * _TREMOR_RAD,
-    )
+    return reach * sway[:, :3] * _SWAY_M + shake, sway[:, 3:] * _SWAY_RAD + shake_turn
 
 
-def _oscillation(rng: np.random.Generator, times: FloatArray, band_hz: tuple[float, float], count: int) -> FloatArray:
+def hand_tremor(rng: np.random.Generator, times: FloatArray, scale: float) -> tuple[FloatArray, FloatArray]:
+    """Return the hand's tremor at times (N,): metres (N, 3) and rotation vectors (N, 3)."""
+    tremor = oscillation(rng, times, _TREMOR_HZ, 8) * scale
+    return tremor[:, :3] * _TREMOR_M, tremor[:, 3:] * _TREMOR_RAD
+
+
+def oscillation(rng: np.random.Generator, times: FloatArray, band_hz: tuple[float, float], count: int) -> FloatArray:
     """Return six independent sums of sinusoids (N, 6) of unit variance; amplitudes fall with frequency."""
     frequency = np.sort(rng.uniform(*band_hz, (6, count)), axis=1)
     amplitude = rng.uniform(0.5, 1.0, (6, count)) * band_hz[0] / frequency
@@ -167,7 +173,7 @@ def _camera_axes(path: ScanPath, stripe_angle: float) -> FloatArray:
     return np.stack([x, y, forward], axis=1)
 
 
-def _smooth_step(x: FloatArray) -> FloatArray:
+def smooth_step(x: FloatArray) -> FloatArray:
     """Return a step from 0 to 1 over x in [0, 1] with four continuous derivatives."""
     x = np.clip(x, 0.0, 1.0)
     result: FloatArray = x**5 * (126 - 420 * x + 540 * x**2 - 315 * x**3 + 70 * x**4)

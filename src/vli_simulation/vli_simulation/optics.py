@@ -14,7 +14,8 @@ SUBPIXELS = ((-0.3, 0.16), (0.3, -0.16))
 """Rays per pixel where one is not enough: not in one row or column, their mean is the pixel's centre."""
 _DEFOCUS_PX = 0.5
 _MIN_SMEAR_PX = 0.08
-_DIM_STEP = 3
+DIM_STEP = 3
+"""Pixels from ray to ray of the dim grid."""
 
 
 class Lens:
@@ -32,8 +33,8 @@ class Lens:
         self.coarse_shape = camera.height // 2 + 1, camera.width // 2 + 1
         self.coarse_rays = _with_depth(camera.unproject(_grid_pixels(self.coarse_shape, 2)))
         """Of every second pixel, and one row and column beyond the image."""
-        self.dim_shape = -(-camera.height // _DIM_STEP) + 1, -(-camera.width // _DIM_STEP) + 1
-        self.dim_rays = _with_depth(camera.unproject(_grid_pixels(self.dim_shape, _DIM_STEP)))
+        self.dim_shape = -(-camera.height // DIM_STEP) + 1, -(-camera.width // DIM_STEP) + 1
+        self.dim_rays = _with_depth(camera.unproject(_grid_pixels(self.dim_shape, DIM_STEP)))
         """Of every third pixel, and one row and column beyond the image."""
         self._focal_px = camera.focal_px
         self._jacobian = self._jacobians(camera, flat)
@@ -42,7 +43,7 @@ class Lens:
 
     def enlarge(self, dim: Float32Array) -> Float32Array:
         """Return an image (h, w) or (h, w, C) on the dim grid at full resolution, bilinear."""
-        matrix = np.array([[1 / _DIM_STEP, 0, 0], [0, 1 / _DIM_STEP, 0]])
+        matrix = np.array([[1 / DIM_STEP, 0, 0], [0, 1 / DIM_STEP, 0]])
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         return np.asarray(cv2.warpAffine(dim, matrix, (self.width, self.height), flags=flags, borderMode=cv2.BORDER_REPLICATE))
 

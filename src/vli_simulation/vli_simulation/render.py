@@ -23,12 +23,14 @@ from vli_simulation.texture import noise_table
 
 T = TypeVar("T")
 
-_GREY_OF_WHITE = 330.0
+GREY_OF_WHITE = 330.0
 """Grey level of a white surface that faces the light at the nominal distance, in the nominal long exposure."""
-_NOMINAL_LONG_S, _NOMINAL_SHORT_S = 0.005, 0.0004
-_STRIPE_OF_WHITE = 900.0
+NOMINAL_LONG_S, NOMINAL_SHORT_S = 0.005, 0.0004
+"""Exposures that the grey levels here are stated for."""
+STRIPE_OF_WHITE = 900.0
 """Grey level in the middle of the stripe on white, nominal short exposure: white saturates three and a half times."""
-_WAIST, _DIVERGENCE = 0.8e-4, 1.4e-3
+WAIST, DIVERGENCE = 0.8e-4, 1.4e-3
+"""Of the laser's sheet: sigma in metres where it leaves the laser, and its growth per metre."""
 _FAN_RAYS = 1600
 _VISIBLE_GREY = 12.0
 
@@ -106,7 +108,7 @@ class Renderer:
         self._tiles = scene.tiles
         self._table = noise_table(seed)
         self._lens = Lens(rig.camera, config.sensor.vignetting)
-        self._grain = _grain_kernel(np.deg2rad(config.rig.stripe_angle_deg))
+        self._grain = grain_kernel(np.deg2rad(config.rig.stripe_angle_deg))
         self._memory = Memory()
 
     def long_frame(self, view: View) -> Float32Array:
@@ -116,21 +118,22 @@ class Renderer:
     def _long_frame(self, view: View) -> Float32Array:
         radiance, depth = self._full_view(view)
         exposure = self._config.sensor.exposure_long_s
-        return self._lens.expose(radiance, depth, view.velocity, view.rate, exposure, _GREY_OF_WHITE * exposure / _NOMINAL_LONG_S)
+        return self._lens.expose(radiance, depth, view.velocity, view.rate, exposure, GREY_OF_WHITE * exposure / NOMINAL_LONG_S)
 
     def short_frame(self, view: View, rng: np.random.Generator) -> Float32Array:
         """Return the short exposure with the laser on, as :meth:`long_frame`; ``rng`` draws the speckle."""
-        gain = _STRIPE_OF_WHITE * self._config.sensor.exposure_short_s / _NOMINAL_SHORT_S
+        gain = STRIPE_OF_WHITE * self._config.sensor.exposure_short_s / NOMINAL_SHORT_S
         image = self._memory.recall("dim", view, self._dim_frame).copy()
         stripe = self._memory.recall("stripe", view, self._stripe).copy()
-        self._lens.add_laser(self._speckled(stripe, rng), self._rig.laser.response, gain, image)
+        add_speckle(stripe, self._grain, self._config.sensor.speckle, rng)
+        self._lens.add_laser(stripe, self._rig.laser.response, gain, image)
         return image
 
     def _dim_frame(self, view: View) -> Float32Array:
         """Return the short exposure with the laser off."""
         radiance, depth = self._dim_view(view)
         exposure = self._config.sensor.exposure_short_s
-        return self._lens.expose(radiance, depth, view.velocity, view.rate, exposure, _GREY_OF_WHITE * exposure / _NOMINAL_LONG_S)
+        return self._lens.expose(radiance, depth, view.velocity, view.rate, exposure, GREY_OF_WHITE * exposure / NOMINAL_LONG_S)
 
     def seen(self, view: View) -> SeenPoints:
         """Return what the laser lights and the camera sees bright enough to be noticed; read only."""
@@ -144,8 +147,8 @@ class Renderer:
         vignette = self._lens.vignette[nearest[:, 1], nearest[:, 0]][:, None]
         sensor = self._config.sensor
         laser = (albedo @ self._rig.laser.response) * self._sheet(view, buffer) * vignette[:, 0]
-        bright = laser * _STRIPE_OF_WHITE * sensor.exposure_short_s / _NOMINAL_SHORT_S > _VISIBLE_GREY
-        light = _GREY_OF_WHITE * sensor.exposure_long_s / _NOMINAL_LONG_S * vignette * radiance
+        bright = laser * STRIPE_OF_WHITE * sensor.exposure_short_s / NOMINAL_SHORT_S > _VISIBLE_GREY
+        light = GREY_OF_WHITE * sensor.exposure_long_s / NOMINAL_LONG_S * vignette * radiance
         return SeenPoints(points[bright], light[bright].astype(np.float64), albedo[bright].astype(np.float64))
 
     def _full_view(self, view: View) -> tuple[Float32Array, Float32Array]:
@@ -211,7 +214,7 @@ class Renderer:
             centre = np.clip(np.round(pixels).astype(np.int64), 0, [self._lens.width - 1, self._lens.height - 1])
             mask[centre[:, 1], centre[:, 0]] = 1
             nearest = float(transform(inverse(view.T_world_cam), points)[:, 2].min())
-            radius = int(np.ceil(4.5 * (_WAIST + _DIVERGENCE * nearest) * self._rig.camera.focal_px / nearest)) + 2
+            radius = int(np.ceil(4.5 * (WAIST + DIVERGENCE * nearest) * self._rig.camera.focal_px / nearest)) + 2
             mask = cv2.dilate(mask, np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)).astype(np.uint8)
         return np.flatnonzero(mask)
 
@@ -222,7 +225,7 @@ class Renderer:
         normal = view.T_world_cam[:3, :3] @ laser.normal
         plane = np.array([*normal, -float(normal @ origin)])
         out = np.empty(len(buffer.depth), np.float32)
-        shading.sheet_irradiance(buffer, origin, plane, _WAIST, _DIVERGENCE, self._nominal, out)
+        shading.sheet_irradiance(buffer, origin, plane, WAIST, DIVERGENCE, self._nominal, out)
         cut = np.flatnonzero(out > 0)
         out[cut] *= self.caster.visible(origin, buffer.points[cut])
         return out
@@ -259,19 +262,19 @@ class Renderer:
         shading.illuminate(buffer, albedo, self._materials, np.ascontiguousarray(view.eye), light, axis, self._nominal, radiance)
         return albedo, radiance
 
-    def _speckled(self, stripe: Float32Array, rng: np.random.Generator) -> Float32Array:
-        """Multiply the stripe (H, W) by a log-normal field of mean 1 whose grains are drawn out along it."""
-        rows, columns = np.flatnonzero(stripe.any(axis=1)), np.flatnonzero(stripe.any(axis=0))
-        if len(rows):
-            box = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-            sigma = np.float32(np.sqrt(np.log1p(self._config.sensor.speckle**2)))
-            field = rng.standard_normal(stripe[box].shape, dtype=np.float32)
-            stripe[box] *= np.exp(sigma * cv2.filter2D(field, -1, self._grain) - np.float32(0.5) * sigma**2)
-        return stripe
+
+def add_speckle(stripe: Float32Array, grain: Float32Array, contrast: float, rng: np.random.Generator) -> None:
+    """Multiply a stripe (H, W), in place, by a log-normal field of mean 1 whose grains are those of :func:`grain_kernel`."""
+    rows, columns = np.flatnonzero(stripe.any(axis=1)), np.flatnonzero(stripe.any(axis=0))
+    if len(rows):
+        box = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+        sigma = np.float32(np.sqrt(np.log1p(contrast**2)))
+        field = rng.standard_normal(stripe[box].shape, dtype=np.float32)
+        stripe[box] *= np.exp(sigma * cv2.filter2D(field, -1, grain) - np.float32(0.5) * sigma**2)
 
 
-def _grain_kernel(angle: float) -> Float32Array:
-    """Return a 9×9 kernel of unit energy, sigma 1.6 px along the stripe and 0.6 px across."""
+def grain_kernel(angle: float) -> Float32Array:
+    """Return a 9×9 kernel of unit energy, sigma 1.6 px along the stripe, which runs at ``angle`` (rad), and 0.6 px across."""
     y, x = np.mgrid[-4:5, -4:5].astype(np.float64)
     along, across = x * np.cos(angle) + y * np.sin(angle), -x * np.sin(angle) + y * np.cos(angle)
     kernel = np.exp(-0.5 * ((along / 1.6) ** 2 + (across / 0.6) ** 2))

@@ -19,6 +19,7 @@ _FOCAL_OF_WIDTH = 0.567
 _LENSES = {"radtan": (-0.112, 0.014, 6e-4, -4e-4), "equidistant": (-0.021, 0.006, -0.002, 4e-4), "none": (0.0, 0.0, 0.0, 0.0)}
 _LASER_RESPONSE = {"red": (0.012, 0.07, 1.0), "blue": (1.0, 0.10, 0.015)}
 _LASER_TILT_DEG = 0.8
+_LENS_SPREAD = 0.08
 _R_CAM_IMU = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 
@@ -62,36 +63,50 @@ class Rig:
     document: dict[str, Any]
 
 
-def make_rig(config: SimulationConfig, seed: int) -> Rig:
-    """Return the instrument of a seed, with its calibration document."""
+def make_rig(config: SimulationConfig, seed: int, spread: float = 1.0) -> Rig:
+    """Return the instrument of a seed, with its calibration document.
+
+    Args:
+        config: what it is made of.
+        seed: of its misalignments.
+        spread: scales them; 1 for parts of one batch, 0 for the drawing itself.
+    """
     rng = np.random.default_rng([seed, 1])
-    intrinsics = _intrinsics(config, rng)
-    coefficients = _LENSES[config.rig.lens]
+    intrinsics = _intrinsics(config, rng, spread)
+    coefficients = _coefficients(config, seed, spread)
     camera = make_camera(config.rig.lens, intrinsics, coefficients, (config.rig.width, config.rig.height))
     T_cam_imu = pose(
-        so3_exp(rng.normal(0, np.deg2rad(0.8), 3)) @ _R_CAM_IMU, np.array([0.005, -0.007, 0.009]) + rng.normal(0, 1e-3, 3)
+        so3_exp(spread * rng.normal(0, np.deg2rad(0.8), 3)) @ _R_CAM_IMU,
+        np.array([0.005, -0.007, 0.009]) + spread * rng.normal(0, 1e-3, 3),
     )
-    laser = _make_laser(config, rng)
+    laser = _make_laser(config, rng, spread)
     light = np.array([-0.005, -0.006, 0.001]) if abs(config.rig.stripe_angle_deg) < 45 else np.array([-0.006, 0.005, 0.001])
     return Rig(camera, T_cam_imu, laser, light, _document(config, intrinsics, coefficients, T_cam_imu, laser))
 
 
-def _intrinsics(config: SimulationConfig, rng: np.random.Generator) -> tuple[float, float, float, float]:
+def _coefficients(config: SimulationConfig, seed: int, spread: float) -> tuple[float, ...]:
+    """Return the lens of the drawing, unless parts differ by more than those of one batch."""
+    drawn = np.array(_LENSES[config.rig.lens])
+    wider = _LENS_SPREAD * max(spread - 1.0, 0.0) * np.random.default_rng([seed, 19]).uniform(-1, 1, len(drawn))
+    return tuple(np.round(drawn * (1 + wider), 6).tolist())
+
+
+def _intrinsics(config: SimulationConfig, rng: np.random.Generator, spread: float) -> tuple[float, float, float, float]:
     width, height = config.rig.width, config.rig.height
-    focal = _FOCAL_OF_WIDTH * width * (1 + 0.01 * rng.standard_normal())
-    cx = 0.5 * (width - 1) + 0.006 * width * rng.standard_normal()
-    cy = 0.5 * (height - 1) + 0.006 * width * rng.standard_normal()
-    values = (focal, focal * (1 + 0.001 * rng.standard_normal()), cx, cy)
+    focal = _FOCAL_OF_WIDTH * width * (1 + spread * 0.01 * rng.standard_normal())
+    cx = 0.5 * (width - 1) + spread * 0.006 * width * rng.standard_normal()
+    cy = 0.5 * (height - 1) + spread * 0.006 * width * rng.standard_normal()
+    values = (focal, focal * (1 + spread * 0.001 * rng.standard_normal()), cx, cy)
     fx, fy, cx, cy = (round(float(value), 3) for value in values)
     return fx, fy, cx, cy
 
 
-def _make_laser(config: SimulationConfig, rng: np.random.Generator) -> LaserSheet:
+def _make_laser(config: SimulationConfig, rng: np.random.Generator, spread: float) -> LaserSheet:
     angle = np.deg2rad(config.rig.stripe_angle_deg)
     along, perpendicular = np.array([np.cos(angle), np.sin(angle), 0.0]), np.array([-np.sin(angle), np.cos(angle), 0.0])
     origin = config.rig.baseline * perpendicular + np.array([0.0, 0.0, 0.001])
     crossing = np.array([0.0, 0.0, 1.15 * config.motion.distance])
-    tilt = so3_exp(rng.normal(0, np.deg2rad(_LASER_TILT_DEG), 3))
+    tilt = so3_exp(spread * rng.normal(0, np.deg2rad(_LASER_TILT_DEG), 3))
     centre = tilt @ (crossing - origin) / np.linalg.norm(crossing - origin)
     across = tilt @ along
     normal = np.cross(across, centre)

@@ -45,6 +45,13 @@ class Sensor:
         """Return colours (N, 3) of ``light`` (N, 3) without noise, same order of channels."""
         return np.clip(np.round(light + self._config.black_level), 0, 255).astype(np.uint8)
 
+    @staticmethod
+    def develop(mosaic: ByteArray) -> ByteArray:
+        """Return the colours (H, W, 3), blue green red, of a mosaic (H, W)."""
+        # OpenCV names a mosaic by its second row and column: its BG is everyone's RGGB.
+        colour: ByteArray = cv2.cvtColor(mosaic, cv2.COLOR_BayerBG2BGR).astype(np.uint8, copy=False)
+        return colour
+
     def encode(self, mosaic: ByteArray) -> EncodedFrame:
         """Return a mosaic in the encoding of the config."""
         encoding, width = self._config.encoding, mosaic.shape[1]
@@ -52,8 +59,7 @@ class Sensor:
             return EncodedFrame(mosaic.tobytes(), "bayer_rggb8", False, width)
         if encoding == "bayer-png":
             return EncodedFrame(cv2.imencode(".png", mosaic)[1].tobytes(), "bayer_rggb8; png compressed", True)
-        # OpenCV names a mosaic by its second row and column: its BG is everyone's RGGB.
-        colour = cv2.cvtColor(mosaic, cv2.COLOR_BayerBG2BGR)
+        colour = self.develop(mosaic)
         if encoding == "mono":
             return EncodedFrame(cv2.cvtColor(colour, cv2.COLOR_BGR2GRAY).tobytes(), "mono8", False, width)
         if encoding == "rgb":

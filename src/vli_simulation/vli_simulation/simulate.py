@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import collections
-import os
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 import yaml
 
@@ -19,6 +16,7 @@ from vli_common.types import NANOSECONDS
 from vli_simulation.config import SimulationConfig, to_document
 from vli_simulation.imu import ImuRecording, record_imu
 from vli_simulation.motion import Motion, plan_motion
+from vli_simulation.parallel import in_order, single_threaded_opencv
 from vli_simulation.render import Renderer, SeenPoints, View
 from vli_simulation.rig import Rig, make_rig
 from vli_simulation.scenes import make_scene
@@ -83,16 +81,9 @@ class Simulation:
         image = self.sensor.encode(self.sensor.expose(light, rng))
         return Frame(index, int(self.stamps_ns[index]), image, self.renderer.seen(view) if laser_on else None)
 
-    def frames(self, workers: int) -> Iterator[Frame]:
+    def frames(self, workers: int | None) -> Iterator[Frame]:
         """Yield all frames in order, rendered by ``workers`` threads a few frames ahead."""
-        with ThreadPoolExecutor(workers) as pool:
-            pending: collections.deque[Future[Frame]] = collections.deque()
-            for index in range(len(self)):
-                pending.append(pool.submit(self.frame, index))
-                if len(pending) > 2 * workers:
-                    yield pending.popleft().result()
-            while pending:
-                yield pending.popleft().result()
+        return in_order(self.frame, len(self), workers)
 
     def imu(self) -> ImuRecording:
         """Return the IMU's recording."""
@@ -150,37 +141,33 @@ def write_recording(
     passes = [(start_s + start, start_s + end) for start, end in simulation.motion.passes]
     write_passes(out / "passes.json", simulation.path_length, passes)
     _write_surface(simulation, out / "surface.ply")
-    seen = _write_bag(simulation, out / "bag", workers or os.cpu_count() or 1, progress)
+    seen = _write_bag(simulation, out / "bag", workers, progress)
     write_ply(
         out / "seen.ply", "what the laser saw, thinned to 0.25 mm; colour as lit, noise-free; albedo beside it", seen.rows()
     )
 
 
-def _write_bag(simulation: Simulation, path: Path, workers: int, progress: Callable[[int], object] | None) -> SeenCloud:
+def _write_bag(simulation: Simulation, path: Path, workers: int | None, progress: Callable[[int], object] | None) -> SeenCloud:
     config, seen = simulation.config, SeenCloud()
-    # Frames are the unit of parallel work here: threads within OpenCV would only compete with them.
-    threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        with BagWriter(
-            path, simulation.rig, config.imu, config.sensor.encoding in ("jpeg", "bayer-png"), config.exposure_topic
-        ) as bag:
-            samples = collections.deque(simulation.imu())
-            for frame in simulation.frames(workers):
-                while samples and samples[0].stamp_ns <= frame.stamp_ns:
-                    bag.add_imu(samples.popleft())
-                laser_on = frame.seen is not None
-                exposure = config.sensor.exposure_short_s if laser_on else config.sensor.exposure_long_s
-                bag.add_frame(frame.stamp_ns, frame.image, exposure, laser_on)
-                if frame.seen is not None:
-                    colour = simulation.sensor.ideal(frame.seen.light)
-                    seen.add(frame.seen.points, colour, np.clip(np.round(255 * frame.seen.albedo), 0, 255).astype(np.uint8))
-                if progress:
-                    progress(1)
-            for sample in samples:
-                bag.add_imu(sample)
-    finally:
-        cv2.setNumThreads(threads)
+    compressed = config.sensor.encoding in ("jpeg", "bayer-png")
+    with (
+        single_threaded_opencv(),
+        BagWriter(path, simulation.rig, config.imu, compressed, config.exposure_topic) as bag,
+    ):
+        samples = collections.deque(simulation.imu())
+        for frame in simulation.frames(workers):
+            while samples and samples[0].stamp_ns <= frame.stamp_ns:
+                bag.add_imu(samples.popleft())
+            laser_on = frame.seen is not None
+            exposure = config.sensor.exposure_short_s if laser_on else config.sensor.exposure_long_s
+            bag.add_frame(frame.stamp_ns, frame.image, exposure, laser_on)
+            if frame.seen is not None:
+                colour = simulation.sensor.ideal(frame.seen.light)
+                seen.add(frame.seen.points, colour, np.clip(np.round(255 * frame.seen.albedo), 0, 255).astype(np.uint8))
+            if progress:
+                progress(1)
+        for sample in samples:
+            bag.add_imu(sample)
     return seen
 
 

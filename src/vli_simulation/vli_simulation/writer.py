@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -17,17 +17,22 @@ from vli_common.arrays import AnyArray, FloatArray
 from vli_common.geometry import quaternion_from_rotation
 from vli_common.types import NANOSECONDS, ImuSample
 from vli_simulation.config import ImuConfig
+from vli_simulation.imu import ImuRecording
 from vli_simulation.rig import Rig
 from vli_simulation.sensor import EncodedFrame
 
 CAMERA_FRAME, IMU_FRAME = "camera_optical_frame", "imu_link"
 _UNKNOWN_ORIENTATION = np.array([-1.0, *[0.0] * 8])
+_BLOCK = 16384
 
 
 class BagWriter:
     """Writes the recording's messages; a context manager. Messages are to come in the order of their stamps."""
 
-    def __init__(self, path: Path, rig: Rig, imu: ImuConfig, compressed: bool, exposure_topic: bool) -> None:
+    def __init__(
+        self, path: Path, rig: Rig, imu: ImuConfig, compressed: bool, exposure_topic: bool, with_camera: bool = True
+    ) -> None:
+        self._with_camera = with_camera
         self._store = get_typestore(Stores.ROS2_JAZZY)
         self._writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
         self._rig, self._compressed, self._exposure_topic = rig, compressed, exposure_topic
@@ -38,9 +43,12 @@ class BagWriter:
     def __enter__(self) -> BagWriter:
         self._writer.open()
         image = ("/camera/image_raw/compressed", "CompressedImage") if self._compressed else ("/camera/image_raw", "Image")
-        for name, topic, kind in (
+        camera = [
             ("image", image[0], f"sensor_msgs/msg/{image[1]}"),
             ("info", "/camera/camera_info", "sensor_msgs/msg/CameraInfo"),
+        ]
+        for name, topic, kind in (
+            *(camera if self._with_camera else []),
             ("imu", "/imu", "sensor_msgs/msg/Imu"),
             *([("exposure", "/camera/exposure", "diagnostic_msgs/msg/DiagnosticArray")] if self._exposure_topic else []),
         ):
@@ -52,9 +60,44 @@ class BagWriter:
 
     def add_imu(self, sample: ImuSample) -> None:
         """Write one IMU sample."""
+        self._write("imu", sample.stamp_ns, self._imu_message(sample))
+
+    def add_imu_recording(self, recording: ImuRecording, progress: Callable[[int], object] | None = None) -> None:
+        """Write a whole recording: the same bytes as :meth:`add_imu`, but faster: only numbers are filled in."""
+        connection, kind = self._connections["imu"], self._imu_layout()
+        still = ImuSample(0, np.zeros(3), np.zeros(3))
+        template = bytes(self._store.serialize_cdr(self._imu_message(still), connection.msgtype))
+        for first in range(0, len(recording.stamps_ns), _BLOCK):
+            block = slice(first, first + _BLOCK)
+            stamps = recording.stamps_ns[block]
+            rows = np.frombuffer(bytearray(template * len(stamps)), kind)
+            rows["sec"], rows["nanosec"] = stamps // NANOSECONDS, stamps % NANOSECONDS
+            rows["gyro"], rows["accel"] = recording.gyro[block], recording.accel[block]
+            data, size = memoryview(rows.tobytes()), kind.itemsize
+            for index, stamp in enumerate(stamps.tolist()):
+                self._writer.write(connection, stamp, data[index * size : (index + 1) * size])
+            if progress:
+                progress(len(stamps))
+
+    def _imu_layout(self) -> np.dtype[np.void]:
+        """Return where the numbers of a serialised Imu stand: after a header of 4 bytes, doubles are aligned to 8."""
+        text_end = 12 + len(IMU_FRAME) + 1
+        orientation = 4 + -(-text_end // 8) * 8
+        gyro = orientation + 8 * (4 + 9)
+        accel = gyro + 8 * (3 + 9)
+        return np.dtype(
+            {
+                "names": ["sec", "nanosec", "gyro", "accel"],
+                "formats": ["i4", "u4", ("f8", 3), ("f8", 3)],
+                "offsets": [4, 8, gyro, accel],
+                "itemsize": accel + 8 * (3 + 9),
+            }
+        )
+
+    def _imu_message(self, sample: ImuSample) -> object:
         make = self._store.types
         vector, quaternion = make["geometry_msgs/msg/Vector3"], make["geometry_msgs/msg/Quaternion"]
-        message = make["sensor_msgs/msg/Imu"](
+        return make["sensor_msgs/msg/Imu"](
             header=self._header(sample.stamp_ns, IMU_FRAME),
             orientation=quaternion(x=0.0, y=0.0, z=0.0, w=1.0),
             orientation_covariance=_UNKNOWN_ORIENTATION,
@@ -63,7 +106,6 @@ class BagWriter:
             linear_acceleration=vector(*(float(value) for value in sample.accel)),
             linear_acceleration_covariance=self._accel_covariance,
         )
-        self._write("imu", sample.stamp_ns, message)
 
     def add_frame(self, stamp_ns: int, frame: EncodedFrame, exposure_s: float, laser_on: bool) -> None:
         """Write one frame with its camera info and, where asked for, its exposure."""
