@@ -92,7 +92,7 @@ class WindowEstimator:
         self._predictor = Predictor(self._T_imu_cam)
         self._predictor.set_keyframe(first.stamp_ns, state)
         self._covariance = PoseCovariance(self._T_imu_cam, config.covariance_scale)
-        self._covariance.set_keyframe(state.T_map_imu, self._smoother.newest_covariance())
+        self._covariance.set_keyframe(first.stamp_ns, state.T_map_imu, self._smoother.newest_covariance())
         self._measure_depths()
         self._points = self._landmarks.points(self._keyframe_poses())
 
@@ -154,7 +154,7 @@ class WindowEstimator:
             FrameRecord(self._window.stamps[-1], self._state.T_map_imu @ self._T_imu_cam, self._window.stationary[-1])
         ]
         self._predictor.set_keyframe(self._window.stamps[-1], self._state)
-        self._covariance.set_keyframe(self._state.T_map_imu, self._smoother.newest_covariance())
+        self._covariance.set_keyframe(self._window.stamps[-1], self._state.T_map_imu, self._smoother.newest_covariance())
 
     def flush(self, session: int) -> WindowPoses | None:
         """Return all frames as final, those after the newest keyframe included."""
@@ -222,7 +222,7 @@ class WindowEstimator:
         self._records = [FrameRecord(tracks.stamp_ns, T @ self._T_imu_cam, tracks.stationary)]
         self._T_map_odom = T @ inverse(T_odom_imu)
         window = self._leave(session)
-        self._covariance.set_keyframe(T, self._smoother.newest_covariance())
+        self._covariance.set_keyframe(tracks.stamp_ns, T, self._smoother.newest_covariance(), self._on_map)
         pose = self._estimate(
             tracks.stamp_ns, self._records[0].T_map_camera, self._state.velocity, self._covariance.of_keyframe(), session
         )
@@ -317,6 +317,12 @@ class WindowEstimator:
                 stripes = [(poses[slot], self._scans[-1])] if len(self._window) == 1 else []
             if stripes:
                 measure_slot(self._landmarks, slot, poses[slot], stripes, self._focal_px, self._config)
+
+    @property
+    def _on_map(self) -> bool:
+        """Whether map constraints on scans of the window took part in the newest solve."""
+        constraints = self.constraints
+        return constraints is not None and bool((constraints.scan_stamps > self._window.stamps[0]).any())
 
     # -- views -------------------------------------------------------------------------------------------------------------
 

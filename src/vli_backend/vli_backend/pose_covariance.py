@@ -7,14 +7,25 @@ the keyframe moves rigidly with it; its own adjustment adds what the features le
     P = Ad(T_frame_keyframe) P_keyframe Ad(T_frame_keyframe)ᵀ + P_frame,
 
 for right perturbations [ω, v] (Barfoot & Furgale, 2014, to first order).
+
+Eq. (4) takes the map as it is, so the smoother knows the pose against the map only. But the map is no truer than the poses that
+it was built with: where it holds the window, the covariance of the place it was seen from is added, as that of a consider state.
 """
 
 from __future__ import annotations
+
+import math
+from dataclasses import dataclass
 
 import numpy as np
 
 from vli_common.arrays import FloatArray
 from vli_common.geometry import inverse, skew
+
+_INDEPENDENT_NS = 5_000_000_000
+"""Only map points of this age hold the window."""
+_PLACE_M = 1e-3
+"""Covariances are remembered this far apart."""
 
 
 def adjoint(T: FloatArray) -> FloatArray:
@@ -52,10 +63,32 @@ class PoseCovariance:
         self._scale = scale
         self._T_map_imu = np.eye(4)
         self._keyframe = np.zeros((6, 6))
+        self._map = np.zeros((6, 6))
+        self._places: list[_Place] = []
 
-    def set_keyframe(self, T_map_imu: FloatArray, covariance: FloatArray) -> None:
-        """Take pose (4, 4) and marginal covariance (6, 6), [ω, v] in imu_link, of the newest keyframe."""
-        self._T_map_imu, self._keyframe = T_map_imu, covariance
+    def set_keyframe(self, stamp_ns: int, T_map_imu: FloatArray, covariance: FloatArray, on_map: bool = False) -> None:
+        """Take the newest keyframe.
+
+        Args:
+            stamp_ns: of the keyframe.
+            T_map_imu: (4, 4).
+            covariance: (6, 6), marginal, [ω, v] in imu_link.
+            on_map: True where the map holds the window.
+        """
+        place = self._seen_from(stamp_ns, T_map_imu) if on_map else None
+        self._map = place.covariance_of(T_map_imu) if place else _carried(self._map, self._T_map_imu, T_map_imu)
+        self._T_map_imu, self._keyframe = T_map_imu, covariance + self._map
+        if place is None and self._is_new_ground(T_map_imu):
+            self._places.append(_Place(stamp_ns, T_map_imu, self._keyframe))
+
+    def _seen_from(self, stamp_ns: int, T_map_imu: FloatArray) -> _Place | None:
+        """Return the nearest place whose stripes may be in the map."""
+        places = [place for place in self._places if stamp_ns - place.stamp_ns >= _INDEPENDENT_NS]
+        return min(places, key=lambda place: place.distance(T_map_imu), default=None)
+
+    def _is_new_ground(self, T_map_imu: FloatArray) -> bool:
+        """Return False near the last place, so that nothing grows at rest."""
+        return not self._places or self._places[-1].distance(T_map_imu) > _PLACE_M
 
     def of_keyframe(self) -> FloatArray:
         """Return the covariance (6, 6) of the newest keyframe, in the order of ROS."""
@@ -68,6 +101,29 @@ class PoseCovariance:
             T_map_imu: (4, 4).
             information: (6, 6) of the frame's own adjustment, [ω, v] in the camera, keyframe and landmarks held.
         """
-        carry = adjoint(inverse(T_map_imu) @ self._T_map_imu)
         own = self._to_body @ np.linalg.inv(information) @ self._to_body.T
-        return self._scale * in_map_axes(carry @ self._keyframe @ carry.T + own, T_map_imu[:3, :3])
+        carried = _carried(self._keyframe, self._T_map_imu, T_map_imu)
+        return self._scale * in_map_axes(carried + own, T_map_imu[:3, :3])
+
+
+@dataclass(frozen=True)
+class _Place:
+    """A keyframe on new ground: the map around it was built from there."""
+
+    stamp_ns: int
+    T_map_imu: FloatArray
+    covariance: FloatArray
+
+    def distance(self, T_map_imu: FloatArray) -> float:
+        return math.dist(self.T_map_imu[:3, 3], T_map_imu[:3, 3])
+
+    def covariance_of(self, T_map_imu: FloatArray) -> FloatArray:
+        """Return the covariance (6, 6) of a pose that is rigidly tied to this one."""
+        return _carried(self.covariance, self.T_map_imu, T_map_imu)
+
+
+def _carried(covariance: FloatArray, T_map_before: FloatArray, T_map_after: FloatArray) -> FloatArray:
+    """Return the covariance (6, 6) of the pose after, when it moves rigidly with the pose before."""
+    carry = adjoint(inverse(T_map_after) @ T_map_before)
+    result: FloatArray = carry @ covariance @ carry.T
+    return result

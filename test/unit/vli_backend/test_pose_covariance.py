@@ -37,7 +37,7 @@ def test_the_covariance_of_a_frame_is_that_of_poses_drawn_around_keyframe_and_fr
     frame = keyframe @ step
     P_keyframe, P_camera = _covariance(rng, 1e-4), _covariance(rng, 1e-4)
     carried = PoseCovariance(T_imu_cam, 1.0)
-    carried.set_keyframe(keyframe, P_keyframe)
+    carried.set_keyframe(0, keyframe, P_keyframe)
 
     samples = []
     for xi, own in zip(
@@ -57,9 +57,35 @@ def test_a_keyframe_is_reported_in_the_order_of_ros_and_scaled() -> None:
     carried = PoseCovariance(np.eye(4), 0.5)
     turned = so3_exp(np.array([0.0, 0.0, np.pi / 2]))
     covariance = np.diag([1.0, 2.0, 3.0, 4.0, 5.0, 6.0])
-    carried.set_keyframe(pose(turned, np.zeros(3)), covariance)
+    carried.set_keyframe(0, pose(turned, np.zeros(3)), covariance)
     np.testing.assert_allclose(np.diag(carried.of_keyframe()), 0.5 * np.array([5.0, 4.0, 6.0, 2.0, 1.0, 3.0]))
     np.testing.assert_allclose(np.trace(in_map_axes(covariance, turned)), np.trace(covariance))
+
+
+def test_on_the_map_the_place_it_was_seen_from_counts_too_and_goes_on_counting_beyond_it() -> None:
+    def at(x: float) -> FloatArray:
+        return pose(np.eye(3), np.array([x, 0.0, 0.0]))
+
+    def sigma() -> float:
+        return float(np.sqrt(carried.of_keyframe()[0, 0]))
+
+    carried = PoseCovariance(np.eye(4), 1.0)
+    for second in range(11):
+        carried.set_keyframe(second * 10**9, at(0.01 * second), (1e-5 * second) ** 2 * np.eye(6))
+    against_the_map = 1e-12 * np.eye(6)
+    carried.set_keyframe(12 * 10**9, at(0.05), against_the_map, on_map=True)
+    np.testing.assert_allclose(sigma(), 5e-5, rtol=0.01)
+    carried.set_keyframe(13 * 10**9, at(0.02), against_the_map, on_map=True)
+    np.testing.assert_allclose(sigma(), 2e-5, rtol=0.01)
+    carried.set_keyframe(14 * 10**9, at(-0.01), (1e-5) ** 2 * np.eye(6))
+    np.testing.assert_allclose(sigma(), np.hypot(2e-5, 1e-5), rtol=0.01)
+
+
+def test_the_youngest_places_are_not_in_the_map_yet() -> None:
+    carried = PoseCovariance(np.eye(4), 1.0)
+    carried.set_keyframe(0, np.eye(4), 1e-8 * np.eye(6))
+    carried.set_keyframe(2 * 10**9, np.eye(4), 4e-8 * np.eye(6), on_map=True)
+    np.testing.assert_allclose(np.diag(carried.of_keyframe()), 4e-8)
 
 
 def test_what_is_reported_starts_at_zero_and_grows_along_an_odometry() -> None:
