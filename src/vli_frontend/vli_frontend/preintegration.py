@@ -9,6 +9,7 @@ from vli_common.arrays import FloatArray
 from vli_common.calibration import ImuCalibration
 from vli_common.types import Counters, ImuBias, Preintegration
 from vli_frontend.config import ImuConfig
+from vli_frontend.imu_noise import NoiseMonitor
 from vli_frontend.synchroniser import ImuSegment, Synchroniser, seconds_to_ns
 
 GRAVITY = 9.81
@@ -39,7 +40,8 @@ class Preintegrator:
     """Measurements between the last keyframe and each frame after it.
 
     Samples are instants: each step takes the mean of its two ends, the first and the last step end at the frames' own stamps.
-    Every answer is integrated afresh (1.5 µs a sample), so that it may be kept.
+    Every answer is integrated afresh (1.5 µs a sample), so that it may be kept. Noise is that of the calibration, or what the
+    samples show where that is clearly more.
 
     Args:
         imu: noise of the calibration.
@@ -49,7 +51,7 @@ class Preintegrator:
     """
 
     def __init__(self, imu: ImuCalibration, config: ImuConfig, synchroniser: Synchroniser, counters: Counters) -> None:
-        self._imu, self._config = imu, config
+        self._noise, self._config = NoiseMonitor(imu), config
         self._params = combined_params(imu, config)
         self._interpolated_ns, self._longest_ns = seconds_to_ns(config.interpolated_gap_s), seconds_to_ns(config.longest_gap_s)
         self._synchroniser = synchroniser
@@ -63,6 +65,10 @@ class Preintegrator:
 
     def start(self, keyframe_ns: int) -> None:
         """Begin a new interval at a keyframe (camera clock)."""
+        ended = None if self._from_ns is None else self._synchroniser.segment(self._from_ns, keyframe_ns)
+        if ended is not None and self._noise.update(ended):
+            self._params = combined_params(self._noise.imu, self._config)
+            self._counters.add("imu_noise_changes")
         self._from_ns, self._interval_bias = keyframe_ns, self._bias
 
     def reset(self) -> None:
@@ -84,7 +90,7 @@ class Preintegrator:
         return Preintegration(stamp_ns, self._from_ns, self._integrate(segment, inflate), inflate, session)
 
     def _integrate(self, segment: ImuSegment, inflate: float) -> gtsam.PreintegratedCombinedMeasurements:
-        params = self._params if inflate == 1.0 else combined_params(self._imu, self._config, inflate)
+        params = self._params if inflate == 1.0 else combined_params(self._noise.imu, self._config, inflate)
         measurements = gtsam.PreintegratedCombinedMeasurements(params, self._interval_bias)
         accel, gyro = _midpoints(segment.accel), _midpoints(segment.gyro)
         for a, w, dt in zip(accel, gyro, (np.diff(segment.stamps) * 1e-9).tolist(), strict=True):
