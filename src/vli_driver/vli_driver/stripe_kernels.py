@@ -24,6 +24,8 @@ _SHOT_GAIN = 0.1
 """Variance per grey level of signal: some ten electrons to a grey level, as small 8-bit sensors have."""
 _UNEVEN = 0.15
 _TOP = 0.85
+_BLEACHED = 200
+"""Grey level of any channel from which a pixel tells no colour: an overexposed line is white, whatever its laser."""
 
 
 @njit(cache=True, nogil=True)
@@ -239,14 +241,31 @@ def _spread(profiles, i, channel, centre, half, background, noise):  # type: ign
 
 
 @njit(cache=True, nogil=True)
-def _other_channels(profiles, i, channel, centre, half, reach):  # type: ignore[no-untyped-def]
-    """Return Σ I of the mean of the other channels in the same window, zero where there are none."""
-    total = 0.0
+def _bleached(profiles, i, j):  # type: ignore[no-untyped-def]
+    brightest = 0
     for c in range(profiles.shape[2]):
-        if c != channel:
-            left, right = _sides(profiles, i, c, centre, reach)
-            total += _moments(profiles, i, c, centre - half, centre + half, left, right)[0]
-    return max(total, 0.0) / max(profiles.shape[2] - 1, 1)
+        brightest = max(brightest, profiles[i, j, c])
+    return brightest >= _BLEACHED
+
+
+@njit(cache=True, nogil=True)
+def _other_channels(profiles, i, channel, centre, half, reach, total):  # type: ignore[no-untyped-def]
+    """Return Σ I of the mean of the other channels for a line of Σ I ``total``, as its pixels that are not overexposed tell.
+
+    Zero where there are no other channels, or no such pixel.
+    """
+    count = profiles.shape[2]
+    own, others = 0.0, 0.0
+    for c in range(count):
+        left, right = _sides(profiles, i, c, centre, reach)
+        ground = 0.5 * (left + right)
+        for j in range(max(int(centre - half + 0.5), 0), min(int(centre + half + 0.5), profiles.shape[1] - 1) + 1):
+            if count > 1 and not _bleached(profiles, i, j):
+                if c == channel:
+                    own += profiles[i, j, c] - ground
+                else:
+                    others += profiles[i, j, c] - ground
+    return total * max(others, 0.0) / ((count - 1) * own) if own > 0 and count > 1 else 0.0
 
 
 @njit(cache=True, nogil=True)
@@ -298,7 +317,7 @@ def locate(profiles, channel, peaks, smoothing, noise, threshold, window_sigmas,
         if top - (max(sides[0], sides[1]) - 0.5 * (left + right)) < threshold:
             continue
         out[i, 0], out[i, 1], out[i, 2], out[i, 3], out[i, 4] = centre, top, total, sensor, speckle
-        out[i, 5] = _other_channels(profiles, i, channel, centre, half, reach)
+        out[i, 5] = _other_channels(profiles, i, channel, centre, half, reach, total)
         out[i, 6] = (centre - foot) / (high - low)
         out[i, 7] = width
     return out

@@ -1,0 +1,82 @@
+"""The straight line that the stripe on a flat surface is: in bearings, a great circle, whatever the lens."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vli_common.arrays import BoolArray, FloatArray, IntArray
+from vli_common.camera import CameraModel
+
+_TRIALS = 200
+_REFINEMENTS = 10
+_OUTLIER_SIGMAS = 3.5
+_LEAST_TOLERANCE_PX = 0.5
+_SEED = 5
+
+
+@dataclass(frozen=True, slots=True)
+class StripeLine:
+    """A line fitted to points of a stripe.
+
+    Args:
+        normal: (3,) unit, of the plane through the camera's centre that holds the line.
+        residuals_px: (N,) signed distances of all points, pixels at the image centre's scale.
+        inliers: (N,) the points that lie on it.
+        scatter_px: robust standard deviation of the inliers about it.
+    """
+
+    normal: FloatArray
+    residuals_px: FloatArray
+    inliers: BoolArray
+    scatter_px: float
+
+
+def bearings(camera: CameraModel, pixels: FloatArray) -> FloatArray:
+    """Return unit viewing directions (N, 3) of raw pixels (N, 2); NaN where the lens model has none."""
+    rays = np.column_stack([camera.unproject(pixels), np.ones(len(pixels))])
+    result: FloatArray = rays / np.linalg.norm(rays, axis=1)[:, None]
+    return result
+
+
+def fit_stripe_line(camera: CameraModel, pixels: FloatArray, tolerance_px: float = 2.0) -> StripeLine | None:
+    """Return the great circle that most points lie on (RANSAC, then trimmed least squares), None where there is none.
+
+    Args:
+        camera: its lens is taken out.
+        pixels: (N, 2) raw.
+        tolerance_px: of the search; the refinement finds the scatter of the points itself.
+    """
+    directions = bearings(camera, pixels)
+    valid: BoolArray = np.isfinite(directions).all(axis=1)
+    if valid.sum() < 3:
+        return None
+    directions = np.where(valid[:, None], directions, 0.0)
+    inliers = valid & _largest_consensus(directions, np.flatnonzero(valid), tolerance_px / camera.focal_px)
+    normal, residuals, scatter = np.zeros(3), np.full(len(pixels), np.inf), 0.0
+    for _ in range(_REFINEMENTS):
+        if inliers.sum() < 3:
+            return None
+        normal = np.linalg.svd(directions[inliers], full_matrices=False)[2][2]
+        residuals = np.where(valid, directions @ normal * camera.focal_px, np.inf)
+        scatter = 1.4826 * float(np.median(np.abs(residuals[inliers])))
+        previous, inliers = inliers, np.abs(residuals) <= max(_OUTLIER_SIGMAS * scatter, _LEAST_TOLERANCE_PX)
+        if (inliers == previous).all():
+            break
+    return StripeLine(normal, residuals, inliers, scatter)
+
+
+def _largest_consensus(directions: FloatArray, candidates: IntArray, tolerance: float) -> BoolArray:
+    """Return which directions (N, 3) lie within ``tolerance`` radians of the best great circle through two of them."""
+    pairs = np.random.default_rng(_SEED).choice(candidates, (_TRIALS, 2))
+    normals = np.cross(directions[pairs[:, 0]], directions[pairs[:, 1]])
+    length = np.linalg.norm(normals, axis=1)
+    # Two neighbours tell no direction.
+    apart = length > 5 * tolerance
+    normals = normals[apart] / length[apart][:, None]
+    if not len(normals):
+        return np.zeros(len(directions), np.bool_)
+    near = np.abs(directions @ normals.T) <= tolerance
+    best: BoolArray = near[:, int(near.sum(axis=0).argmax())]
+    return best
