@@ -14,6 +14,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 from tiny_bag import TinyBag, write_calibration
 
 from vli_bringup.cli import main
@@ -107,6 +109,49 @@ def test_a_node_that_cannot_start_says_why_in_one_line(executable: str, paramete
     assert complaint in result.stderr
     assert result.stderr.count("\n") == 1
     assert result.returncode == 2
+
+
+def change_state(listener: GraphListener, node: str, transition: int) -> bool:
+    """Do what a lifecycle manager does; return whether the node obeyed."""
+    client = listener.node.create_client(ChangeState, f"{node}/change_state")
+    assert client.wait_for_service(_START_S)
+    future = client.call_async(ChangeState.Request(transition=Transition(id=transition)))
+    wait(listener, future.done, 30.0)
+    listener.node.destroy_client(client)
+    return bool(future.result().success)
+
+
+def test_a_lifecycle_manager_takes_a_node_through_its_states(listener: GraphListener, calibration: Path) -> None:
+    process = subprocess.Popen(command("demux_node", "autostart:=false", f"calibration_file:={calibration}"))
+    try:
+        for transition, state in (
+            (None, NodeState.UNCONFIGURED),
+            (Transition.TRANSITION_CONFIGURE, NodeState.INACTIVE),
+            (Transition.TRANSITION_ACTIVATE, NodeState.READY),
+            (Transition.TRANSITION_DEACTIVATE, NodeState.INACTIVE),
+            (Transition.TRANSITION_CLEANUP, NodeState.UNCONFIGURED),
+            (Transition.TRANSITION_CONFIGURE, NodeState.INACTIVE),
+            (Transition.TRANSITION_ACTIVATE, NodeState.READY),
+        ):
+            assert transition is None or change_state(listener, "demux_node", transition)
+            wait(listener, lambda state=state: listener.state("demux_node") is state)
+        assert change_state(listener, "demux_node", Transition.TRANSITION_ACTIVE_SHUTDOWN)
+        assert process.wait(10.0) == 0
+    finally:
+        process.kill()
+
+
+def test_a_node_that_cannot_be_configured_stays_as_it_is(listener: GraphListener) -> None:
+    process = subprocess.Popen(
+        command("demux_node", "autostart:=false", "calibration_file:=none.yaml"), stderr=subprocess.DEVNULL
+    )
+    try:
+        wait(listener, lambda: listener.state("demux_node") is NodeState.UNCONFIGURED)
+        assert not change_state(listener, "demux_node", Transition.TRANSITION_CONFIGURE)
+        wait(listener, lambda: listener.state("demux_node") is NodeState.UNCONFIGURED)
+        assert process.poll() is None
+    finally:
+        process.kill()
 
 
 def test_a_reset_begins_a_new_session_in_every_node(

@@ -8,6 +8,7 @@ from typing import Any
 
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
 from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
@@ -40,15 +41,17 @@ class GraphListener:
         """The newest status of each node."""
         self._recorder = recorder
         self._received = Counters()
+        self.node: Node
+        """The listener's own, while it is in the graph."""
 
     def __enter__(self) -> GraphListener:
         """Join the graph."""
         set_transport_profile()
         rclpy.init(signal_handler_options=rclpy.SignalHandlerOptions.NO)
-        self._node = rclpy.create_node(LISTENER, namespace=NAMESPACE)
+        self.node = rclpy.create_node(LISTENER, namespace=NAMESPACE)
         self._executor = SingleThreadedExecutor()
-        self._executor.add_node(self._node)
-        self._publisher = self._node.create_publisher(message_type(STATUS), STATUS.name, quality(STATUS))
+        self._executor.add_node(self.node)
+        self._publisher = self.node.create_publisher(message_type(STATUS), STATUS.name, quality(STATUS))
         self._subscribe(STATUS, self._on_status)
         recorded = [self._subscribe(POSE, self._on_pose), self._subscribe(WINDOW, self._on_window)]
         self._recorded = dict(zip(_RECORDED, recorded, strict=True))
@@ -57,7 +60,7 @@ class GraphListener:
     def __exit__(self, *_: object) -> None:
         """Leave the graph."""
         self._executor.shutdown()
-        self._node.destroy_node()
+        self.node.destroy_node()
         rclpy.try_shutdown()
 
     def spin(self) -> None:
@@ -104,7 +107,7 @@ class GraphListener:
         Raises:
             GraphError: no answer in time, or a refusal.
         """
-        client = self._node.create_client(Trigger, service)
+        client = self.node.create_client(Trigger, service)
         future = client.call_async(Trigger.Request())
         deadline_s = time.monotonic() + timeout_s
         while not future.done() and time.monotonic() < deadline_s:
@@ -132,7 +135,7 @@ class GraphListener:
         self._publisher.publish(status_to_message(StageStatus(time.time_ns(), LISTENER, Health.OK, NodeState.READY, "", values)))
 
     def _subscribe(self, topic: Topic, handle: Callable[[Any], None]) -> Subscription:
-        return self._node.create_subscription(message_type(topic), topic.name, handle, quality(topic, reading=True))
+        return self.node.create_subscription(message_type(topic), topic.name, handle, quality(topic, reading=True))
 
     def _on_pose(self, message: Any) -> None:
         self._received.add(POSE.name)

@@ -25,10 +25,14 @@ class Health(Enum):
 class NodeState(Enum):
     """Where a node stands in its life."""
 
+    UNCONFIGURED = "unconfigured"
+    """For a lifecycle manager."""
     WAITING = "waiting"
     """For its calibration."""
     WARMING = "warming"
     """Compiling its kernels."""
+    INACTIVE = "inactive"
+    """Configured, but told to rest by a lifecycle manager."""
     READY = "ready"
     PAUSED = "paused"
     FINISHED = "finished"

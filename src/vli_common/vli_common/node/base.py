@@ -9,25 +9,24 @@ import time
 import traceback
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 import rclpy
-from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.subscription import Subscription
 from std_msgs.msg import Header, String
 from std_srvs.srv import Trigger
 
 from vli_common.calibration import Calibration, load_calibration, parse_calibration, to_yaml
 from vli_common.errors import CalibrationError, MessageError, VliError
 from vli_common.messages import Session, session_from_message, session_to_message, status_from_message, status_to_message
+from vli_common.node.inputs import Input
+from vli_common.node.lifecycle import ManagedNode
 from vli_common.node.parameters import NodeConfig, NodeParameters
 from vli_common.node.transport import message_type, pending, quality
 from vli_common.node.worker import Worker
-from vli_common.status import Health, LatencyMeter, NodeState, RateMeter, StageStatus
+from vli_common.status import Health, LatencyMeter, NodeState, StageStatus
 from vli_common.topics import CALIBRATION, DIAGNOSTICS, NAMESPACE, SESSION, STATUS, Topic
 from vli_common.types import Counters, Mode
 
@@ -35,30 +34,15 @@ T = TypeVar("T")
 
 _STATUS_PERIOD_S = 1.0
 _FINISH_PERIOD_S = 0.1
-_QUIET_S = 1.0
-"""An input that fell short of what its source sent is given up after this long without a message."""
 _QUEUE_DEPTHS = 12
 """The worker's queue holds this many times the depth of the topic."""
+_WAITING_HINT = "waiting for a calibration: give 'calibration_file' to the driver node or to this one"
 _STOP_S = 2.0
 _CALL_S = 10.0
 
 
-@dataclass
-class _Input:
-    """One subscription with its bookkeeping; ``ends`` and ``required`` as in :meth:`VliNode.receive`."""
-
-    topic: Topic
-    name: str
-    ends: bool
-    required: bool
-    subscription: Subscription | None = None
-    rate: RateMeter = field(default_factory=RateMeter)
-    received: int = 0
-    last_s: float = field(default_factory=time.monotonic)
-
-
-class VliNode(Node):
-    """Parameters, calibration, session, worker, status, services.
+class VliNode(ManagedNode):
+    """Parameters, calibration, session, worker, status, services, lifecycle.
 
     A subclass makes its publishers and calls :meth:`receive` in its constructor, and overrides the hooks (``create_stage`` …
     ``stage_health``), all of which run in the worker thread.
@@ -70,11 +54,10 @@ class VliNode(Node):
 
     Raises:
         ConfigError: an invalid parameter.
-        CalibrationError: an invalid calibration file.
     """
 
     def __init__(self, name: str, configs: Mapping[type, str], needs_calibration: bool = True) -> None:
-        super().__init__(name, namespace=NAMESPACE)
+        super().__init__(name, NAMESPACE)
         self.parameters = NodeParameters(self, configs)
         self.node_config = self.parameters.config(NodeConfig)
         self.mode = Mode(self.node_config.mode)
@@ -83,26 +66,35 @@ class VliNode(Node):
         self._newest_session = 0
         self.counters = Counters()
         self.latency = LatencyMeter()
-        self.state = NodeState.WAITING if needs_calibration else NodeState.WARMING
+        self.state = NodeState.UNCONFIGURED
         self.failure: str | None = None
         self._needs_calibration = needs_calibration
-        self._hint = "waiting for a calibration: give 'calibration_file' to the driver node or to this one"
+        self._hint = "waiting for a lifecycle manager to configure it: 'autostart' is false"
         self._calibration_hint = ""
         self._worker = Worker(name, self.fail)
-        self._inputs: dict[str, _Input] = {}
+        self._inputs: dict[str, Input] = {}
         self._publishers_by_topic: dict[str, Publisher] = {}
         self._sent = Counters()
         self._finished_sources: dict[str, dict[str, str]] = {}
         self.others: dict[str, StageStatus] = {}
         """The newest status of each node, this one too."""
-        if self.node_config.calibration_file:
-            self.calibration = self._load_calibration()
+        self._offered: Calibration | None = None
         self._connect()
 
     # Hooks
 
+    def check(self) -> None:
+        """Raise where the node cannot be configured; runs in the main thread, before anything is made.
+
+        Raises:
+            VliError: what is missing or wrong.
+        """
+
     def create_stage(self, calibration: Calibration | None) -> None:
         """Make the stage objects (again, where parameters have changed) and warm their kernels."""
+
+    def drop_stage(self) -> None:
+        """Let go of the stage objects: the node is cleaned up."""
 
     def on_session(self, session: Session) -> None:
         """Drop all state of other sessions; ``self.session`` is the new one."""
@@ -111,7 +103,7 @@ class VliNode(Node):
         """Bring to an end what is under way."""
 
     def on_resume(self) -> None:
-        """Go on after a pause."""
+        """Begin, or go on after a pause."""
 
     def on_finish(self) -> None:
         """Process what is still held back: the input has ended."""
@@ -147,13 +139,11 @@ class VliNode(Node):
             required: False for an input that may have no publisher.
             limit: messages that may wait for the worker, by default 12 times the depth of the topic.
         """
-        entry = _Input(topic, name or topic.name, ends, required)
+        entry = Input(topic, name or topic.name, ends, required)
         most = limit or _QUEUE_DEPTHS * topic.depth
 
         def accept(message: Any) -> None:
-            entry.rate.add()
-            entry.received += 1
-            entry.last_s = time.monotonic()
+            entry.count()
             self._worker.put(topic.name, partial(self._process, entry, read, handle, message, entry.last_s), most)
 
         def callback(message: Any) -> None:
@@ -244,10 +234,50 @@ class VliNode(Node):
     # Life
 
     def start(self) -> None:
-        """Start the worker; the stage is made as soon as there is a calibration."""
+        """Start the worker and, unless ``autostart`` is false, configure and activate.
+
+        Raises:
+            VliError: the node cannot be configured.
+        """
         self._worker.start()
+        if self.node_config.autostart:
+            self.bring_up()
+        else:
+            self.publish_status()
+
+    def configure(self) -> None:
+        """Read the calibration; the stage is made as soon as there is one."""
+        self.check()
+        self.calibration = self._load_calibration() if self.node_config.calibration_file else self._offered
         if self.calibration is not None or not self._needs_calibration:
             self._make_ready()
+        else:
+            self.set_state(NodeState.WAITING, _WAITING_HINT)
+
+    def activate(self) -> None:
+        """Process what comes from now on."""
+        self.enqueue(self._go_on)
+
+    def deactivate(self) -> None:
+        """Bring to an end what is under way; what comes from now on is dropped and counted."""
+
+        def rest() -> None:
+            if self.state is NodeState.READY:
+                self.on_pause()
+            if self.state in (NodeState.READY, NodeState.PAUSED):
+                self.set_state(NodeState.INACTIVE)
+
+        self.enqueue(rest)
+
+    def clean_up(self) -> None:
+        """Drop stage and calibration."""
+
+        def drop() -> None:
+            self.drop_stage()
+            self.calibration = None
+            self.set_state(NodeState.UNCONFIGURED, "cleaned up")
+
+        self.call(drop)
 
     def close(self) -> bool:
         """Stop the worker and destroy the node; return False where a job would not end."""
@@ -282,15 +312,23 @@ class VliNode(Node):
         def prepare() -> None:
             self.create_stage(self.calibration)
             self.on_session(Session(self.session, "start"))
-            self.set_state(NodeState.READY)
+            self.set_state(NodeState.INACTIVE)
+            self._go_on()
 
         self.enqueue(prepare)
 
+    def _go_on(self) -> None:
+        """Become ready, where the stage is there and the node active."""
+        if self.is_active and self.state is NodeState.INACTIVE:
+            self.on_resume()
+            self.set_state(NodeState.READY)
+
     def _process(
-        self, entry: _Input, read: Callable[[Any], T], handle: Callable[[T], None], message: Any, arrived_s: float
+        self, entry: Input, read: Callable[[Any], T], handle: Callable[[T], None], message: Any, arrived_s: float
     ) -> None:
-        if self.state not in (NodeState.READY, NodeState.FINISHED):
-            self.counters.add(f"{entry.topic.name}_while_{self.state.value}")
+        if not self.is_active or self.state not in (NodeState.READY, NodeState.FINISHED):
+            state = self.state if self.is_active else NodeState.INACTIVE
+            self.counters.add(f"{entry.topic.name}_while_{state.value}")
             return
         try:
             value = read(message)
@@ -327,10 +365,11 @@ class VliNode(Node):
             self._calibration_hint = str(error)
             self.get_logger().error(self._calibration_hint)
             return
-        if self.calibration is None:
+        self._offered = calibration
+        if self.state is NodeState.WAITING:
             self.calibration = calibration
             self._make_ready()
-        elif to_yaml(calibration.document) != to_yaml(self.calibration.document):
+        elif self.calibration is not None and to_yaml(calibration.document) != to_yaml(self.calibration.document):
             used = self.node_config.calibration_file or "the first one"
             self._calibration_hint = f"the calibration on the topic differs from '{used}', which is used"
             self.get_logger().warning(self._calibration_hint)
@@ -357,10 +396,10 @@ class VliNode(Node):
 
         def begin() -> None:
             self.session, self._sent = session.number, Counters()
-            if self.parameters.changed and self.state is not NodeState.WAITING:
+            if self.parameters.changed and self.state not in (NodeState.UNCONFIGURED, NodeState.WAITING):
                 self.parameters.changed = False
                 self.create_stage(self.calibration)
-            if self.state in (NodeState.READY, NodeState.FINISHED, NodeState.PAUSED):
+            if self.state in (NodeState.READY, NodeState.FINISHED, NodeState.PAUSED, NodeState.INACTIVE):
                 self.on_session(session)
                 self.state = NodeState.READY if self.state is NodeState.FINISHED else self.state
             self.publish_status()
@@ -384,21 +423,13 @@ class VliNode(Node):
         inputs = [entry for entry in self._inputs.values() if entry.ends]
         if self.state is not NodeState.READY or not inputs or not self._worker.is_idle:
             return
-        if all(self._has_ended(entry) for entry in inputs):
+        if all(entry.has_ended(self._finished_sources) for entry in inputs):
 
             def finish() -> None:
                 self.on_finish()
                 self.set_state(NodeState.FINISHED)
 
             self.enqueue(finish)
-
-    def _has_ended(self, entry: _Input) -> bool:
-        (source,) = entry.topic.sources
-        values = self._finished_sources.get(source)
-        if values is None:
-            return False
-        sent = int(values.get(f"sent.{entry.topic.name}", "0"))
-        return entry.received >= sent or time.monotonic() - entry.last_s > _QUIET_S
 
     # Services and status
 
@@ -437,20 +468,11 @@ class VliNode(Node):
             values={"session": str(self.session), **values, **self._figures()},
         )
 
-    def _unmatched(self) -> list[str]:
-        """Return the inputs that the node needs and nobody publishes."""
-        return [
-            entry.name
-            for entry in self._inputs.values()
-            if entry.required and entry.subscription is not None and not entry.subscription.get_publisher_count()
-        ]
-
     def _figures(self) -> dict[str, str]:
-        figures = {"unmatched": ",".join(self._unmatched()), "cpu_s": f"{time.process_time():.2f}"}
+        unmatched = [entry.name for entry in self._inputs.values() if entry.is_unmatched]
+        figures = {"unmatched": ",".join(unmatched), "cpu_s": f"{time.process_time():.2f}"}
         for name, entry in self._inputs.items():
-            figures[f"rate_hz.{name}"] = f"{entry.rate.read_hz():.1f}"
-            figures[f"received.{name}"] = str(entry.received)
-            figures[f"waiting.{name}"] = str(self._worker.waiting(name))
+            figures |= entry.figures(self._worker.waiting(name))
         percentiles = self.latency.percentiles_ms()
         if percentiles:
             figures["latency_p50_ms"], figures["latency_p99_ms"] = (f"{value:.2f}" for value in percentiles)

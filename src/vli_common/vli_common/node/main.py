@@ -70,7 +70,7 @@ def _run(factory: Callable[[], VliNode], stop: threading.Event) -> tuple[int, bo
 def _spin(node: VliNode, stop: threading.Event) -> None:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    while not stop.is_set() and node.failure is None:
+    while not (stop.is_set() or node.failure or node.is_shut_down):
         executor.spin_once(timeout_sec=_SIGNAL_S)
         time.sleep(_REST_S)
     executor.shutdown(timeout_sec=0)

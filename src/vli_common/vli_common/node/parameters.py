@@ -36,6 +36,7 @@ class NodeConfig:
     )
     calibration_file: str = parameter("", doc="calibration; empty: from the topic 'calibration'")
     imu_calibration_file: str = parameter("", doc="Kalibr's separate IMU file, where imu0 is not in the calibration")
+    autostart: bool = parameter(True, doc="configure and activate at start; false: wait for a lifecycle manager")
 
 
 def descriptor(spec: ParameterSpec, read_only: bool = False) -> ParameterDescriptor:

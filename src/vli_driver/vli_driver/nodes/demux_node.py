@@ -62,6 +62,10 @@ class DemuxNode(VliNode):
         if calibration is not None and self.mode.uses_laser:
             self._scanner = StripeScanner(calibration, self.parameters.config(StripeConfig))
 
+    def drop_stage(self) -> None:
+        """Let go of the scanner."""
+        self._scanner = None
+
     def on_session(self, session: Session) -> None:
         """Begin a stream."""
         self._demultiplexer.reset()

@@ -35,27 +35,35 @@ class DriverNode(VliNode):
     def __init__(self) -> None:
         super().__init__("driver_node", {DriverConfig: "", PlaybackConfig: ""}, needs_calibration=False)
         self._playback = self.parameters.config(PlaybackConfig)
-        self._player = BagPlayer(self._playback.rate, self._publish_item, self._on_jump)
+        self._player = self._make_player()
         self._thread: threading.Thread | None = None
-        self._open_reader()
         for topic in (CALIBRATION, IMAGE_RAW, IMAGE_RAW_COMPRESSED, EXPOSURE, IMU):
             self.advertise(topic)
 
+    def check(self) -> None:
+        """Open the bag, to see whether that can be done."""
+        self._open_reader()
+
     def create_stage(self, calibration: Calibration | None) -> None:
-        """Publish the calibration and start to play."""
+        """Publish the calibration."""
         if calibration is not None:
             self.send(CALIBRATION, String(data=to_yaml(calibration.document)))
-        if self._playback.bag and self._thread is None:
-            self._thread = threading.Thread(target=self._play, name="player", daemon=True)
-            self._thread.start()
+
+    def drop_stage(self) -> None:
+        """Stop the playback; the next one begins at the beginning."""
+        self._stop_playing()
+        self._player, self._thread = self._make_player(), None
 
     def on_pause(self) -> None:
         """Hold the playback."""
         self._player.pause()
 
     def on_resume(self) -> None:
-        """Go on with the playback."""
+        """Start to play, or go on."""
         self._player.resume()
+        if self._playback.bag and self._thread is None:
+            self._thread = threading.Thread(target=self._play, name="player", daemon=True)
+            self._thread.start()
 
     def stage_counters(self) -> Counters:
         """Return the counters of the playback."""
@@ -69,10 +77,16 @@ class DriverNode(VliNode):
 
     def close(self) -> bool:
         """Stop the playback, then the node."""
+        self._stop_playing()
+        return super().close()
+
+    def _stop_playing(self) -> None:
         self._player.stop()
         if self._thread is not None:
             self._thread.join(1.0)
-        return super().close()
+
+    def _make_player(self) -> BagPlayer:
+        return BagPlayer(self._playback.rate, self._publish_item, self._on_jump)
 
     def _open_reader(self) -> BagReader | None:
         if not self._playback.bag:
