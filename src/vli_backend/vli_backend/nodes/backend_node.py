@@ -99,6 +99,10 @@ class BackEndNode(VliNode):
             T_imu_camera = inverse(calibration.T_cam_imu)
             self.send(TF_STATIC, TFMessage(transforms=[transform_to_message(0, IMU_FRAME, CAMERA_FRAME, T_imu_camera)]))
 
+    def drop_stage(self) -> None:
+        """Let go of the back end."""
+        self._back_end = None
+
     def on_session(self, session: Session) -> None:
         """Hand over what the old session has left, then begin the new one."""
         self._send_window(self.back_end.flush())

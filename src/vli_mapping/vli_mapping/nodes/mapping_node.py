@@ -62,6 +62,10 @@ class MappingNode(VliNode):
             warm_up()
             self._mapper = Mapper(calibration, self.parameters.config(MappingConfig), self.mode)
 
+    def drop_stage(self) -> None:
+        """Let go of the mapper and its map."""
+        self._mapper = None
+
     def on_session(self, session: Session) -> None:
         """Begin a map."""
         self.mapper.reset(session.number)
