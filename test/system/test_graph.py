@@ -16,6 +16,8 @@ import numpy as np
 import pytest
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
+from rclpy.qos import qos_profile_sensor_data
+from sensor_msgs.msg import Imu
 from tiny_bag import TinyBag, write_calibration
 
 from vli_bringup.cli import main
@@ -150,6 +152,23 @@ def test_a_node_that_cannot_be_configured_stays_as_it_is(listener: GraphListener
         assert not change_state(listener, "demux_node", Transition.TRANSITION_CONFIGURE)
         wait(listener, lambda: listener.state("demux_node") is NodeState.UNCONFIGURED)
         assert process.poll() is None
+    finally:
+        process.kill()
+
+
+def test_a_sensor_that_publishes_as_best_effort_is_heard(listener: GraphListener) -> None:
+    process = subprocess.Popen(command("frontend_node"), stderr=subprocess.PIPE, text=True)
+    publisher = listener.node.create_publisher(Imu, "/imu", qos_profile_sensor_data)
+    try:
+
+        def is_heard() -> bool:
+            publisher.publish(Imu())
+            return listener.value("frontend_node", "received./imu") > 0
+
+        wait(listener, is_heard)
+        process.send_signal(signal.SIGINT)
+        told = process.communicate(timeout=20)[1]
+        assert "'replay' offers best effort volatile, reliable volatile was asked for; heard as best effort" in told
     finally:
         process.kill()
 

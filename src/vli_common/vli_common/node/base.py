@@ -73,6 +73,7 @@ class VliNode(ManagedNode):
         self._calibration_hint = ""
         self._worker = Worker(name, self.fail)
         self._inputs: dict[str, Input] = {}
+        self._matchers: list[Callable[[], str | None]] = []
         self._publishers_by_topic: dict[str, Publisher] = {}
         self._sent = Counters()
         self._finished_sources: dict[str, dict[str, str]] = {}
@@ -151,8 +152,9 @@ class VliNode(ManagedNode):
             for further in pending(entry.subscription):
                 accept(further)
 
-        entry.subscription = self.create_subscription(message_type(topic), entry.name, callback, quality(topic, reading=True))
+        entry.subscribe(self, callback)
         self._inputs[topic.name] = entry
+        self._matchers.append(partial(entry.adapt, self, callback))
 
     def advertise(self, topic: Topic, name: str | None = None) -> Publisher:
         """Make the publisher of a topic, for :meth:`send`."""
@@ -302,9 +304,15 @@ class VliNode(ManagedNode):
         self.create_subscription(String, CALIBRATION.name, self._on_calibration, quality(CALIBRATION))
         self.create_timer(_STATUS_PERIOD_S, self.publish_status)
         self.create_timer(_FINISH_PERIOD_S, self._check_finish)
+        self.create_timer(_STATUS_PERIOD_S, self._match)
         self.serve("reset", lambda: f"session {self.raise_session(f'reset of {self.get_name()}').number}")
         self.serve("pause", self._pause)
         self.serve("resume", self._resume)
+
+    def _match(self) -> None:
+        for match in self._matchers:
+            if text := match():
+                self.get_logger().warning(text)
 
     def _make_ready(self) -> None:
         self.set_state(NodeState.WARMING)

@@ -1,13 +1,18 @@
-"""The bookkeeping of a subscription."""
+"""A subscription that matches its publisher, and its bookkeeping."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 
+from vli_common.node.transport import message_type, quality
 from vli_common.status import RateMeter
 from vli_common.topics import Topic
 
@@ -34,6 +39,38 @@ class Input:
     rate: RateMeter = field(default_factory=RateMeter)
     received: int = 0
     last_s: float = field(default_factory=time.monotonic)
+    _is_mismatched: bool = False
+
+    def subscribe(self, node: Node, callback: Callable[[Any], None], profile: QoSProfile | None = None) -> None:
+        """Subscribe, reliably unless ``profile`` says otherwise."""
+
+        def note(_: object) -> None:
+            self._is_mismatched = True
+
+        self.subscription = node.create_subscription(
+            message_type(self.topic),
+            self.name,
+            callback,
+            profile or quality(self.topic, reading=True),
+            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=note, use_default_callbacks=False),
+        )
+
+    def adapt(self, node: Node, callback: Callable[[Any], None]) -> str | None:
+        """Subscribe anew where a publisher offers less than was asked for; return what to say of it, None where all match.
+
+        A best-effort publisher never reaches a reliable reader; a best-effort reader hears everybody.
+        """
+        if not self._is_mismatched or self.subscription is None:
+            return None
+        self._is_mismatched = False
+        asked = self.subscription.qos_profile
+        offers = [item for item in node.get_publishers_info_by_topic(self.name) if not _serves(item.qos_profile, asked)]
+        profile = quality(self.topic, reading=True)
+        profile.reliability = ReliabilityPolicy.BEST_EFFORT
+        node.destroy_subscription(self.subscription)
+        self.subscribe(node, callback, profile)
+        named = ", ".join(f"'{item.node_name}' offers {_text(item.qos_profile)}" for item in offers) or "a publisher offers less"
+        return f"'{self.name}': {named}, {_text(asked)} was asked for; heard as best effort from now on, messages may be lost"
 
     def count(self) -> None:
         """Count a message."""
@@ -66,3 +103,12 @@ class Input:
             f"received.{name}": str(self.received),
             f"waiting.{name}": str(waiting),
         }
+
+
+def _serves(offered: QoSProfile, asked: QoSProfile) -> bool:
+    reliable = asked.reliability is not ReliabilityPolicy.RELIABLE or offered.reliability is ReliabilityPolicy.RELIABLE
+    return reliable and offered.durability.value <= asked.durability.value
+
+
+def _text(profile: QoSProfile) -> str:
+    return f"{profile.reliability.name.lower().replace('_', ' ')} {profile.durability.name.lower().replace('_', ' ')}"
