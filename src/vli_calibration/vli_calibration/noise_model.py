@@ -26,6 +26,8 @@ _SIGNIFICANT = 10.0
 """Twice the gain in log likelihood from which the recording needs a flicker component: 1.5 in 1000 by chance."""
 _ALIASES = 30
 _LEVEL = 0.95
+_FAINT = 0.3
+"""Of the upper end of its interval: how large a walk is taken to be that was not seen."""
 _SPAN = np.log(1e9)
 """Farthest that a variance may lie from the scale of the data, as a logarithm."""
 
@@ -62,8 +64,8 @@ class NoiseFit:
         return result
 
     def needed_duration_s(self, precision: float) -> float:
-        """Return how long a recording determines the walk to ± ``precision`` (a ratio, 95 %), were it as large as it may be."""
-        walk = self.walk if self.walk_interval[0] > 0 else self.walk_interval[1]
+        """Return how long a recording determines the walk to ± ``precision`` (a ratio, 95 %), were it as large as it seems."""
+        walk = max(self.walk, _FAINT * self.walk_interval[1])
         theta = np.square([self.white, self.flicker, walk])
         blocks = self.duration_s / self.block_s
         while blocks * self.block_s < 1e8:

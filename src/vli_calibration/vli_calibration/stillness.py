@@ -120,14 +120,21 @@ def _moving(means: FloatArray, scatter: FloatArray) -> BoolArray:
     """Return which blocks (M,) are in motion, from their means and standard deviations (M, 6)."""
     shaking = (scatter > _SHAKING * np.maximum(np.median(scatter, axis=0), 1e-12)).any(axis=1)
     moving: BoolArray = np.logical_or(shaking, _jumps(means))
-    # A slow push hides in the steps from block to block, not in those of longer averages.
-    slow = np.repeat(_jumps(_blocks(means, _SLOW_BLOCKS).mean(axis=1)), _SLOW_BLOCKS)
-    moving[: len(slow)] |= slow
+    # A slow push hides in the steps from block to block, not in those of longer averages of what seemed at rest.
+    weights = _blocks((~_widened(moving)).astype(np.float64)[:, None], _SLOW_BLOCKS)
+    count = weights.sum(axis=1)
+    slow = (_blocks(means, _SLOW_BLOCKS) * weights).sum(axis=1) / np.maximum(count, 1)
+    known = np.flatnonzero(count[:, 0] >= _SLOW_BLOCKS / 2)
+    jumped = np.zeros(len(slow), dtype=bool)
+    jumped[known] = _jumps(slow[known])
+    moving[: len(slow) * _SLOW_BLOCKS] |= np.repeat(jumped, _SLOW_BLOCKS)
     return moving
 
 
 def _jumps(means: FloatArray) -> BoolArray:
     """Return which of M averages (M, 6) differ from a neighbour by more than noise does."""
+    if len(means) < 2:
+        return np.zeros(len(means), dtype=bool)
     steps = np.diff(means, axis=0)
     scale = 1.4826 * np.median(np.abs(steps - np.median(steps, axis=0)), axis=0)
     limit = np.repeat([_STEADY_RATE, _STEADY_FORCE], 3)
