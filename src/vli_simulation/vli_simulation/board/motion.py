@@ -13,9 +13,9 @@ from vli_simulation.board.config import BoardSimulationConfig
 from vli_simulation.motion import MARGIN_S, NODE_S, RAMP_S, Trajectory, hand_tremor, oscillation, smooth_step
 from vli_simulation.rig import Rig
 
-_BAND_HZ = (0.25, 1.3)
+_BAND_HZ = (0.2, 1.0)
 _COMPONENTS = 5
-_TURN_RAD = np.deg2rad([11.0, 11.0, 22.0])
+_TURN_RAD = np.deg2rad([10.0, 10.0, 18.0])
 """Standard deviation of tilt, tilt and roll."""
 _WANDER = np.array([0.10, 0.10, 0.11])
 """Of the distance: aside, aside, and towards the board."""

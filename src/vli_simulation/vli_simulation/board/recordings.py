@@ -24,7 +24,7 @@ from vli_simulation.writer import BagWriter, write_tum
 
 _WHITE_GREY = 150.0
 _STREAM = 25
-_DISTANCE_OF_NEAREST = 1.45
+_DISTANCE_OF_NEAREST = 1.8
 _METERED_VIEWS = 12
 
 

@@ -33,10 +33,10 @@ from vli_simulation.render import (
 from vli_simulation.rig import Rig
 from vli_simulation.texture import noise_table
 
-_SAMPLES, _EDGE_SAMPLES = 16, 64
+_SAMPLES, _EDGE_SAMPLES = 8, 32
 """Rays a pixel: for the laser and the plate's edge, and where an edge of the print crosses it."""
 _SPREAD_PX = 2
-"""How far the 16 samples of a pixel on the sheet's edge may lie from its centre, and the defocus."""
+"""The sheet's light is looked for so far around pixels whose middle it reaches."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class BoardRenderer:
         self._lens = Lens(rig.camera, config.sensor.vignetting)
         self._full = self._make_grid((rig.camera.height, rig.camera.width), 1.0)
         self._dim = self._make_grid(self._lens.dim_shape, DIM_STEP)
-        self._offsets, self._edge_offsets = _lattice(_SAMPLES, 5), _lattice(_EDGE_SAMPLES, 19)
+        self._offsets, self._edge_offsets = _lattice(_SAMPLES, 3), _lattice(_EDGE_SAMPLES, 7)
         self._grain = grain_kernel(np.deg2rad(config.rig.stripe_angle_deg))
         self._memory = Memory()
 
@@ -105,7 +105,7 @@ class BoardRenderer:
             return 0.0, 0.0
         shown = buffer.at(paper)
         radiance = self._radiance(view, shown, self._albedo(shown))
-        stripe = self._irradiance(view, self._look(view, self._full.rays))
+        stripe = self._memory.recall("sheet", view, self._sheet)
         albedo = float(self._surface.materials[PAPER, :3].mean())
         return GREY_OF_WHITE * float(np.quantile(radiance[:, 1], 0.95)), STRIPE_OF_WHITE * albedo * float(stripe.max())
 
@@ -122,7 +122,7 @@ class BoardRenderer:
         """Return (radiance (H, W, 3), depth (H, W)) at full resolution."""
         buffer = self._look(view, grid.rays)
         albedo = self._albedo(buffer)
-        self._print(view, grid.rays, grid.spans, self._edge_offsets, buffer, albedo)
+        self._print(view, grid.rays, buffer, albedo, grid.spans)
         radiance = self._radiance(view, buffer, albedo)
         if grid is self._full:
             self._soften_outline(view, buffer, radiance)
@@ -141,7 +141,7 @@ class BoardRenderer:
         rays = self._subrays(where)
         samples = self._look(view, rays)
         albedo = self._albedo(samples)
-        self._print(view, rays, np.zeros((len(rays), 4), np.float32), np.zeros((1, 2)), samples, albedo)
+        self._print(view, rays, samples, albedo)
         radiance[where] = self._radiance(view, samples, albedo).reshape(_SAMPLES, len(where), 3).mean(axis=0)
 
     def _add_stripe(self, image: Float32Array, view: View, gain: float, rng: np.random.Generator) -> None:
@@ -160,8 +160,7 @@ class BoardRenderer:
             cut = np.flatnonzero(light > 0)
             kept = samples.at(cut)
             albedo = self._albedo(kept)
-            still = np.zeros((len(cut), 4), np.float32)
-            self._print(view, np.ascontiguousarray(rays[cut]), still, np.zeros((1, 2)), kept, albedo)
+            self._print(view, np.ascontiguousarray(rays[cut]), kept, albedo)
             response = self._rig.laser.response / self._rig.laser.response.sum()
             light[cut] *= (albedo @ response).astype(np.float32)
             stripe[where] = light.reshape(_SAMPLES, -1).mean(axis=0)
@@ -169,9 +168,13 @@ class BoardRenderer:
 
     def _band(self, view: View) -> IntArray:
         """Return the pixels (flat index) that the sheet may reach."""
-        lit = (self._irradiance(view, self._look(view, self._full.rays)) > 0).reshape(self._full.shape).astype(np.uint8)
+        lit = self._memory.recall("sheet", view, self._sheet) > 0
         size = 2 * _SPREAD_PX + 1
-        return np.flatnonzero(np.asarray(cv2.dilate(lit, np.ones((size, size), np.uint8))))
+        return np.flatnonzero(np.asarray(cv2.dilate(lit.astype(np.uint8), np.ones((size, size), np.uint8))))
+
+    def _sheet(self, view: View) -> Float32Array:
+        """Return the laser's irradiance (H, W) in the middle of each pixel."""
+        return self._irradiance(view, self._look(view, self._full.rays)).reshape(self._full.shape)
 
     def _irradiance(self, view: View, buffer: GBuffer) -> Float32Array:
         """Return the laser's irradiance (N,), zero where the plate hides the laser."""
@@ -207,13 +210,14 @@ class BoardRenderer:
         return albedo
 
     def _print(
-        self, view: View, rays: Float32Array, spans: Float32Array, offsets: FloatArray, buffer: GBuffer, albedo: Float32Array
+        self, view: View, rays: Float32Array, buffer: GBuffer, albedo: Float32Array, spans: Float32Array | None = None
     ) -> None:
-        """Lay the print over the albedo (N, 3) of what lies along rays (N, 3)."""
+        """Lay the print over the albedo (N, 3) of what lies along rays (N, 3); with ``spans``, averaged over each ray's pixel."""
+        offsets = self._edge_offsets if spans is not None else _NO_OFFSETS
+        spans = _NO_SPANS if spans is None else spans
         ink, board = np.empty(len(rays), np.float32), self._surface
         eye, rotation = np.ascontiguousarray(view.eye), np.ascontiguousarray(view.T_world_cam[:3, :3])
-        plate.ink_share(eye, rotation, rays, spans, offsets, board.ink, board.origin, board.scale, ink)
-        ink[buffer.material != PAPER] = 0.0
+        plate.ink_share(eye, rotation, rays, spans, offsets, buffer.material, board.ink, board.origin, board.scale, ink)
         albedo += ink[:, None] * (board.ink_albedo - albedo)
 
     def _radiance(self, view: View, buffer: GBuffer, albedo: Float32Array) -> Float32Array:
@@ -224,6 +228,7 @@ class BoardRenderer:
         return radiance
 
 
+_NO_OFFSETS, _NO_SPANS = np.zeros((0, 2)), np.zeros((0, 4), np.float32)
 _NO_TILES = np.zeros((1, 2, 2), np.uint8)
 
 

@@ -142,6 +142,7 @@ def ink_share(
     rays: Float32Array,
     spans: Float32Array,
     offsets: FloatArray,
+    material: ByteArray,
     ink: ByteArray,
     origin: FloatArray,
     scale: float,
@@ -153,22 +154,29 @@ def ink_share(
         eye: (3,) of the camera in the board frame; ``rotation`` (3, 3) of the camera.
         rays: (N, 3) of unit depth in the camera frame.
         spans: (N, 4) how the ray's x, y change over one pixel to the right, then over one pixel down.
-        offsets: (K, 2) samples within the pixel, in pixels from its centre, for pixels that an edge crosses.
+        offsets: (K, 2) samples within the pixel, in pixels from its centre, for pixels that an edge crosses; none:
+            rays stand for themselves.
+        material: (N,) what the rays meet; there is ink on paper only.
         ink, origin, scale: see :class:`BoardSurface`.
         out: result.
     """
     for n in range(len(rays)):
+        out[n] = 0.0
+        if material[n] != PAPER:
+            continue
         middle = _ink_at(eye, rotation, rays[n, 0], rays[n, 1], ink, origin, scale)
+        out[n] = middle / 255.0
+        if len(offsets) == 0:
+            continue
         uniform = True
         for corner in range(4):
             a, b = 0.5 - (corner & 1), 0.5 - (corner >> 1)
             x, y = rays[n, 0] + a * spans[n, 0] + b * spans[n, 2], rays[n, 1] + a * spans[n, 1] + b * spans[n, 3]
             uniform = uniform and abs(_ink_at(eye, rotation, x, y, ink, origin, scale) - middle) < 0.5
-        total = middle * len(offsets)
         if not uniform:
             total = 0.0
             for k in range(len(offsets)):
                 a, b = offsets[k, 0], offsets[k, 1]
                 x, y = rays[n, 0] + a * spans[n, 0] + b * spans[n, 2], rays[n, 1] + a * spans[n, 1] + b * spans[n, 3]
                 total += _ink_at(eye, rotation, x, y, ink, origin, scale)
-        out[n] = total / (255.0 * len(offsets))
+            out[n] = total / (255.0 * len(offsets))
