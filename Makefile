@@ -15,7 +15,7 @@ REDUCE := import sys, cv2; whole = cv2.imread(sys.argv[1]); \
 # Tests start ROS graphs of their own: they must not meet those of others on the network.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 
-.PHONY: demo test test-all lint format bench bench-estimator bench-scenes pictures venv config lock clean
+.PHONY: demo test test-all lint format bench bench-estimator bench-goals bench-scenes pictures venv config lock clean
 
 demo: venv
 	$(BIN)/vli demo
@@ -72,6 +72,10 @@ pictures: venv
 # Which stage limits: each gets the truth in turn.
 bench-estimator: venv
 	$(BIN)/python test/perf/bench_estimator.py
+
+# Accuracy against the project's goals; makes its recordings first.
+bench-goals: venv
+	$(BIN)/python test/perf/goals.py
 
 bench-scenes: venv
 	$(BIN)/python test/perf/scenes.py

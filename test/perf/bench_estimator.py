@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ground_truth import Truth
-from injection import KNOWN_BIAS, Injection, Recording, stages_with_truth
+from injection import KNOWN_START, Injection, experiment
 
 from vli_bringup.evaluation import Sources, evaluate
 from vli_bringup.pipeline import Pipeline
@@ -26,7 +26,7 @@ from vli_bringup.report import Value, as_dict
 from vli_bringup.settings import load_settings
 from vli_bringup.warm_up import warm_up
 from vli_common.errors import InputError
-from vli_common.types import Mode
+from vli_common.types import EncodedImage, ImuSample, Mode
 from vli_driver.bag import BagReader, BagTopics
 from vli_mapping.store import write_ply
 
@@ -41,7 +41,7 @@ class Row:
     mode: Mode = Mode.VLI_ODOM
 
 
-_MEASURED = Injection.STRIPE | Injection.TRACKS | Injection.IMU
+_MEASURED = Injection.STRIPE | Injection.TRACKS | Injection.IMU | Injection.START
 ROWS = {
     "measured, odometry": Row(Injection.NOTHING),
     "true stripes": Row(Injection.STRIPE),
@@ -49,7 +49,9 @@ ROWS = {
     "true tracks and stripes": Row(Injection.TRACKS | Injection.STRIPE),
     "IMU without bias": Row(Injection.BIAS),
     "ideal IMU": Row(Injection.IMU),
-    "ideal IMU, true tracks": Row(Injection.IMU | Injection.TRACKS),
+    "true start": Row(Injection.START),
+    "ideal IMU, true start": Row(Injection.IMU | Injection.START),
+    "ideal IMU, true start and tracks": Row(Injection.IMU | Injection.START | Injection.TRACKS),
     "all true": Row(_MEASURED),
     "measured, with the map": Row(Injection.NOTHING, Mode.VLI_SLAM),
     "map from true poses": Row(Injection.MAPPING_POSES, Mode.VLI_SLAM),
@@ -71,19 +73,20 @@ COLUMNS = {
 }
 
 
-def measure(recording: Recording, directory: Path, row: Row) -> dict[str, Value]:
+def measure(directory: Path, items: list[EncodedImage | ImuSample], truth: Truth, row: Row) -> dict[str, Value]:
     """Run one experiment in memory; return the figures of ``vli eval``, none where it never tracked.
 
     Args:
-        recording: what goes in.
         directory: of the recording, for the files of its truth.
+        items: of its bag.
+        truth: the same, as the stages take it.
         row: the experiment.
     """
-    known = bool(row.what & (Injection.BIAS | Injection.IMU))
-    settings = load_settings(None, KNOWN_BIAS if known else ())
-    pipeline = Pipeline(stages_with_truth(recording.truth, settings, row.mode, row.what), row.mode)
-    recorder = Recorder(recording.truth.calibration)
-    for item in recording.with_truth(row.what):
+    settings = load_settings(None, KNOWN_START if Injection.START in row.what else ())
+    prepared = experiment(items, truth, settings, row.mode, row.what)
+    pipeline = Pipeline(prepared.stages, row.mode)
+    recorder = Recorder(truth.calibration)
+    for item in prepared.items:
         recorder.add(pipeline.push(item))
     recorder.add(pipeline.flush())
     with tempfile.TemporaryDirectory() as out:
@@ -118,12 +121,12 @@ def main() -> None:
     everything: dict[str, dict[str, dict[str, Value]]] = {}
     for directory in args.recordings:
         items = list(BagReader(directory / "bag", BagTopics(), 0.0, args.duration))
-        recording = Recording(items, Truth.load(directory))
+        truth = Truth.load(directory)
         print(f"\n| {directory.name} | " + " | ".join(name for name, _ in COLUMNS.values()) + " |")
         print("|---|" + "---:|" * len(COLUMNS))
         everything[directory.name] = {}
         for name in args.rows:
-            figures = everything[directory.name][name] = measure(recording, directory, ROWS[name])
+            figures = everything[directory.name][name] = measure(directory, items, truth, ROWS[name])
             print(f"| {name} | {cells(figures)} |", flush=True)
     if args.json:
         args.json.write_text(json.dumps(everything, indent=1) + "\n")

@@ -50,7 +50,8 @@ class Truth:
 
     def pose(self, stamp_ns: int) -> FloatArray:
         """Return T_world_camera (4, 4) at the nearest stamp of the truth."""
-        return self.poses(np.array([stamp_ns]))[0]
+        result: FloatArray = self.poses(np.array([stamp_ns]))[0]
+        return result
 
     def poses(self, stamps_ns: IntArray) -> FloatArray:
         """Return T_world_camera (N, 4, 4) at the nearest stamps of the truth."""
@@ -94,7 +95,8 @@ class Truth:
         design = np.stack([u, v, np.ones_like(u)], axis=1)
         fitted = np.nan_to_num(inverse_depth) @ np.linalg.pinv(design).T @ design.T
         residual = np.abs(fitted / inverse_depth - 1.0).max(axis=1)
-        return ~(residual < _EDGE_SHARE)
+        result: BoolArray = ~(residual < _EDGE_SHARE)
+        return result
 
 
 class TrueMotion:
@@ -112,13 +114,14 @@ class TrueMotion:
             raise ValueError("the calibration has no 'T_cam_imu', needed for the motion of the IMU")
         stamps = truth.trajectory.stamps_ns
         self._first_ns, self._last_ns = int(stamps[0]), int(stamps[-1])
-        self._timeshift_ns = truth.calibration.timeshift_ns
+        self.timeshift_ns = truth.calibration.timeshift_ns
+        """``t_imu = t_camera + timeshift``."""
         times = (stamps - self._first_ns) / NANOSECONDS
         self._trajectory = motion.Trajectory(times, truth.trajectory.poses @ T_cam_imu, inverse(T_cam_imu))
 
     def state(self, imu_stamps_ns: IntArray) -> motion.Kinematics:
         """Return the state at stamps (N,) of the IMU's clock; beyond the truth that at its ends."""
-        camera_ns = np.clip(imu_stamps_ns - self._timeshift_ns, self._first_ns, self._last_ns)
+        camera_ns = np.clip(imu_stamps_ns - self.timeshift_ns, self._first_ns, self._last_ns)
         return self._trajectory.imu((camera_ns - self._first_ns) / NANOSECONDS)
 
     def imu(self, imu_stamps_ns: IntArray) -> FloatArray:

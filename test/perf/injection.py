@@ -6,14 +6,20 @@ but the error itself changes.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from enum import Flag, auto
+from functools import partial
 
 import numpy as np
 from ground_truth import TrueMotion, Truth
 from scipy.ndimage import uniform_filter1d
 
+from vli_backend.backend import BackEnd
+from vli_backend.config import BackEndConfig
+from vli_backend.depth_prior import DepthPrior
+from vli_backend.estimator import WindowEstimator
+from vli_backend.smoother import KeyframeState, StatePrior
+from vli_backend.starter import Starter
 from vli_bringup.pipeline import Stages
 from vli_bringup.settings import Settings
 from vli_common.arrays import FloatArray
@@ -42,8 +48,8 @@ _STEP_SHARE = 0.05
 """Between two search positions the surface is no edge while depth changes by less than this share."""
 _BIAS_WINDOW_S = 2.0
 """Measured minus ideal, averaged over this long, is the bias: its noise is a hundredth of what matters."""
-KNOWN_BIAS = ("backend.gyro_bias_sigma=1e-4", "backend.accel_bias_sigma=0.01")
-"""Settings that say so where the biases are known; that of the accelerometer also takes the start's tilt, which has its noise."""
+KNOWN_START = ("backend.gyro_bias_sigma=1e-4", "backend.accel_bias_sigma=2e-3")
+"""Settings that say so where the state at the start is true."""
 
 
 class Injection(Flag):
@@ -54,6 +60,7 @@ class Injection(Flag):
     TRACKS = auto()
     BIAS = auto()
     IMU = auto()
+    START = auto()
     MAPPING_POSES = auto()
 
 
@@ -178,21 +185,80 @@ class TruePosesMapper(Mapper):
         return super().add_window(replace(window, T_map_camera=self._T_map_world @ true_poses))
 
 
-def true_imu(samples: list[ImuSample], true_motion: TrueMotion, what: Injection) -> list[ImuSample]:
-    """Return the samples without bias, or as an ideal IMU measures them.
+class TrueStarter(Starter):
+    """Starts at the first keyframe after a stripe, at rest or in motion, with the true state; ``map`` is the world.
 
     Args:
-        samples: as recorded.
-        true_motion: of the IMU.
-        what: with BIAS the noise stays, with IMU it goes too.
+        calibration, config, mode: see :class:`Starter`.
+        imu: true motion and biases.
     """
-    stamps = np.array([sample.stamp_ns for sample in samples])
-    ideal = true_motion.imu(stamps)
-    values = ideal
-    if Injection.IMU not in what:
+
+    def __init__(self, calibration: Calibration, config: BackEndConfig, mode: Mode, imu: ImuTruth) -> None:
+        super().__init__(calibration, config, mode)
+        self._truth = imu
+        self._stripes: list[LaserScan] = []
+        self._start = (calibration, config)
+
+    def add_scan(self, scan: LaserScan) -> None:
+        """See :meth:`Starter.add_scan`."""
+        self._stripes = [*self._stripes[-4:], scan]
+
+    def add_frame(self, frame: FrontEndOutput, T_map_imu: FloatArray) -> WindowEstimator | None:
+        """See :meth:`Starter.add_frame`."""
+        tracks = frame.tracks
+        if not tracks.keyframe or not self._stripes:
+            self.reason = "waiting for a stripe and a keyframe"
+            return None
+        calibration, config = self._start
+        prior = StatePrior(np.full(3, config.tilt_sigma), 1e-6, 1e-3, config.gyro_bias_sigma, config.accel_bias_sigma)
+        depths = DepthPrior.of_scene(calibration, config)
+        self.reason = "started with the truth"
+        return WindowEstimator(calibration, config, tracks, self._truth.state(tracks.stamp_ns), prior, self._stripes, depths)
+
+
+@dataclass(frozen=True)
+class ImuTruth:
+    """What the IMU should have measured, and what it did.
+
+    Args:
+        motion: of the IMU.
+        samples: as recorded.
+        ideal: (N, 6) rate and specific force without an error.
+        bias: (N, 6) slow part of the recorded errors.
+        left: (N, 6) what is left of ``bias`` in the samples that are played.
+    """
+
+    motion: TrueMotion
+    samples: list[ImuSample]
+    ideal: FloatArray
+    bias: FloatArray
+    left: FloatArray
+
+    @staticmethod
+    def of(samples: list[ImuSample], motion: TrueMotion, what: Injection) -> ImuTruth:
+        """Compare the samples with the true motion."""
+        stamps = np.array([sample.stamp_ns for sample in samples])
+        ideal = motion.imu(stamps)
         measured = np.array([np.concatenate([sample.gyro, sample.accel]) for sample in samples])
-        values = measured - bias_of(measured - ideal, float(np.median(np.diff(stamps))) * 1e-9)
-    return [replace(sample, gyro=row[:3], accel=row[3:]) for sample, row in zip(samples, values, strict=True)]
+        bias = bias_of(measured - ideal, float(np.median(np.diff(stamps))) * 1e-9)
+        left = np.zeros_like(bias) if what & (Injection.BIAS | Injection.IMU) else bias
+        return ImuTruth(motion, samples, ideal, bias, left)
+
+    def played(self, what: Injection) -> list[ImuSample]:
+        """Return the samples as recorded, without bias, or as an ideal IMU measures them."""
+        if Injection.IMU in what:
+            return [replace(s, gyro=row[:3], accel=row[3:]) for s, row in zip(self.samples, self.ideal, strict=True)]
+        if Injection.BIAS in what:
+            return [replace(s, gyro=s.gyro - b[:3], accel=s.accel - b[3:]) for s, b in zip(self.samples, self.bias, strict=True)]
+        return self.samples
+
+    def state(self, camera_ns: int) -> KeyframeState:
+        """Return the true state at a stamp of the camera."""
+        imu_ns = np.array([camera_ns + self.motion.timeshift_ns])
+        stamps = np.array([sample.stamp_ns for sample in self.samples])
+        bias = self.left[min(int(np.searchsorted(stamps, imu_ns[0])), len(stamps) - 1)]
+        kinematics = self.motion.state(imu_ns)
+        return KeyframeState(kinematics.T_world_imu[0], kinematics.velocity[0], bias[:3], bias[3:])
 
 
 def bias_of(errors: FloatArray, period_s: float) -> FloatArray:
@@ -202,25 +268,25 @@ def bias_of(errors: FloatArray, period_s: float) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class Recording:
-    """Items of a bag in their order, with its truth."""
+class Experiment:
+    """A pipeline's stages, some of which know the truth, and what to push through them."""
 
+    stages: Stages
     items: list[EncodedImage | ImuSample]
-    truth: Truth
-
-    def with_truth(self, what: Injection) -> Iterator[EncodedImage | ImuSample]:
-        """Yield the items, the IMU's replaced as asked for."""
-        if not what & (Injection.BIAS | Injection.IMU):
-            yield from self.items
-            return
-        samples = [item for item in self.items if isinstance(item, ImuSample)]
-        replaced = iter(true_imu(samples, TrueMotion(self.truth), what))
-        for item in self.items:
-            yield next(replaced) if isinstance(item, ImuSample) else item
 
 
-def stages_with_truth(truth: Truth, settings: Settings, mode: Mode, what: Injection) -> Stages:
-    """Return fresh stages, some of which know the truth."""
+def experiment(
+    items: list[EncodedImage | ImuSample], truth: Truth, settings: Settings, mode: Mode, what: Injection
+) -> Experiment:
+    """Return fresh stages and the items for them, with the truth where it is asked for.
+
+    Args:
+        items: of a bag, in their order.
+        truth: of the recording.
+        settings: of the stages.
+        mode: which sensors take part.
+        what: is true.
+    """
     calibration = truth.calibration
     stages = Stages.create(calibration, settings, mode)
     if Injection.STRIPE in what and mode.uses_laser:
@@ -229,4 +295,10 @@ def stages_with_truth(truth: Truth, settings: Settings, mode: Mode, what: Inject
         stages.front_end = TrueTracksFrontEnd(calibration, settings, mode, truth)
     if Injection.MAPPING_POSES in what:
         stages.mapper = TruePosesMapper(calibration, settings, mode, truth)
-    return stages
+    if what & (Injection.BIAS | Injection.IMU | Injection.START):
+        imu = ImuTruth.of([item for item in items if isinstance(item, ImuSample)], TrueMotion(truth), what)
+        if Injection.START in what:
+            stages.back_end = BackEnd(calibration, settings.backend, mode, partial(TrueStarter, imu=imu))
+        played = iter(imu.played(what))
+        items = [next(played) if isinstance(item, ImuSample) else item for item in items]
+    return Experiment(stages, items)

@@ -6,6 +6,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from vli_backend.config import BackEndConfig
@@ -35,9 +37,16 @@ class BackEnd:
         calibration: camera, IMU, laser.
         config: parameters.
         mode: which sensors take part.
+        starter: makes what waits for a start, at first and after every loss.
     """
 
-    def __init__(self, calibration: Calibration, config: BackEndConfig, mode: Mode) -> None:
+    def __init__(
+        self,
+        calibration: Calibration,
+        config: BackEndConfig,
+        mode: Mode,
+        starter: Callable[[Calibration, BackEndConfig, Mode], Starter] = Starter,
+    ) -> None:
         self._calibration = calibration
         self._config = config
         self._mode = mode
@@ -46,7 +55,8 @@ class BackEnd:
         self.state = TrackingState.INITIALISING
         self.reason = "waiting for the first frame"
         self._estimator: WindowEstimator | None = None
-        self._starter = Starter(calibration, config, mode)
+        self._new_starter = starter
+        self._starter = starter(calibration, config, mode)
         self._degraded_since_ns: int | None = None
         self._resume_pose = np.eye(4)
 
@@ -134,5 +144,5 @@ class BackEnd:
     def _restart(self, state: TrackingState, reason: str) -> None:
         self.state, self.reason = state, reason
         self._estimator = None
-        self._starter = Starter(self._calibration, self._config, self._mode)
+        self._starter = self._new_starter(self._calibration, self._config, self._mode)
         self._degraded_since_ns = None

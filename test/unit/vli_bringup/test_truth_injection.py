@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from ground_truth import TrueMotion, Truth, load_surface
-from injection import Injection, TrueTracks, bias_of, stripe_offsets, true_imu, true_stripe
+from injection import ImuTruth, Injection, TrueTracks, bias_of, stripe_offsets, true_stripe
 
 from vli_bringup.tum import Trajectory
 from vli_common import ply
@@ -118,7 +118,7 @@ def test_without_bias_the_noise_stays_and_an_ideal_imu_has_neither(truth: Truth)
     samples = [ImuSample(int(stamp), row[:3], row[3:]) for stamp, row in zip(stamps, measured, strict=True)]
 
     def errors(what: Injection) -> np.ndarray:
-        found = true_imu(samples, true_motion, what)
+        found = ImuTruth.of(samples, true_motion, what).played(what)
         assert [sample.stamp_ns for sample in found] == stamps.tolist()
         return np.array([np.concatenate([s.gyro, s.accel]) for s in found]) - true_motion.imu(stamps)
 
@@ -126,3 +126,19 @@ def test_without_bias_the_noise_stays_and_an_ideal_imu_has_neither(truth: Truth)
     np.testing.assert_allclose(errors(Injection.BIAS).mean(axis=0), 0.0, atol=2e-3)
     assert errors(Injection.BIAS).std() == pytest.approx(0.01, rel=0.05)
     np.testing.assert_allclose(bias_of(np.tile(bias, (50, 1)), 0.005), np.tile(bias, (50, 1)))
+    assert ImuTruth.of(samples, true_motion, Injection.START).played(Injection.START) is samples
+
+
+def test_the_true_state_has_pose_velocity_and_the_bias_that_is_left_in_the_samples(truth: Truth) -> None:
+    stamps = START_NS + np.arange(0, 4900, 5) * 1_000_000
+    true_motion, bias = TrueMotion(truth), np.array([0.01, -0.02, 0.03, 0.1, -0.2, 0.3])
+    samples = [ImuSample(int(s), row[:3], row[3:]) for s, row in zip(stamps, true_motion.imu(stamps) + bias, strict=True)]
+    now_ns, h = START_NS + 60 * FRAME_NS, 1e-5
+    t = 60 * FRAME_NS * 1e-9
+    state = ImuTruth.of(samples, true_motion, Injection.START).state(now_ns)
+    np.testing.assert_allclose(state.T_map_imu, camera_pose(t) @ T_CAM_IMU, atol=1e-6)
+    before, after = (camera_pose(t + d) @ T_CAM_IMU for d in (-h, h))
+    np.testing.assert_allclose(state.velocity, (after - before)[:3, 3] / (2 * h), atol=1e-4)
+    np.testing.assert_allclose(np.concatenate([state.gyro_bias, state.accel_bias]), bias, atol=1e-9)
+    without = ImuTruth.of(samples, true_motion, Injection.START | Injection.BIAS).state(now_ns)
+    assert not np.concatenate([without.gyro_bias, without.accel_bias]).any()
