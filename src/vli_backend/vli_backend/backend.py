@@ -2,6 +2,10 @@
 
 :class:`BackEnd` is the state machine around two estimators: :class:`vli_backend.estimator.WindowEstimator` while tracking and
 :class:`vli_backend.starter.Starter` before.
+
+A loss ends the window, not the session: the map is kept, and the next window begins where the IMU has carried the scanner
+meanwhile. Until :meth:`BackEnd.relocalise` says where that is in the map, the poses carry the uncertainty of the guess and the
+state says so.
 """
 
 from __future__ import annotations
@@ -11,11 +15,16 @@ from collections.abc import Callable
 import numpy as np
 
 from vli_backend.config import BackEndConfig
-from vli_backend.estimator import WindowEstimator
-from vli_backend.smoother import SmootherError
+from vli_backend.dead_reckoning import DeadReckoning
+from vli_backend.depth_prior import DepthPrior
+from vli_backend.estimator import FrameResult, WindowEstimator
+from vli_backend.placement import Placement
+from vli_backend.smoother import SmootherError, StatePrior
 from vli_backend.starter import Starter
+from vli_common.arrays import FloatArray
 from vli_common.calibration import Calibration
 from vli_common.types import (
+    NANOSECONDS,
     BackEndOutput,
     Counters,
     FrontEndOutput,
@@ -28,6 +37,12 @@ from vli_common.types import (
 
 _CONSTRAINTS_AGE = 2
 """Map constraints that answer an older keyframe than this many ago are dropped."""
+_MISSING_NS = 2 * NANOSECONDS
+"""A sensor that says nothing for so long is missed."""
+_RECOVERY_NS = NANOSECONDS
+"""A solver that fails twice within this has lost the window."""
+_RESTART_VELOCITY = 0.02
+"""m/s: how well the velocity is known when a window begins anew from the one before."""
 
 
 class BackEnd:
@@ -57,20 +72,45 @@ class BackEnd:
         self._estimator: WindowEstimator | None = None
         self._new_starter = starter
         self._starter = starter(calibration, config, mode)
-        self._degraded_since_ns: int | None = None
-        self._resume_pose = np.eye(4)
+        self._reckoning, self._placement = DeadReckoning(), Placement()
+        self._last_scan_ns, self._last_imu_ns, self._last_good_ns = 0, 0, 0
+        self._last_failure_ns, self._constraints_after_ns = -_RECOVERY_NS, -1
 
     def reset(self, session: int, reason: str) -> None:
         """Forget everything of the old session and wait for a new start."""
         self.session = session
-        self._resume_pose = np.eye(4)
-        self._restart(TrackingState.INITIALISING, reason)
+        self.state, self.reason = TrackingState.INITIALISING, reason
+        self._begin_map()
+
+    def relocalise(self, T_map_session: FloatArray, sigma_m: float, session: int) -> None:
+        """Take where this session is in the map: from now on everything is published there.
+
+        Args:
+            T_map_session: (4, 4) from what was published as ``map`` so far to the map.
+            sigma_m: standard deviation of the position.
+            session: dropped and counted if it is not the present one.
+        """
+        if session != self.session:
+            self.counters.add("relocalisations_of_other_sessions")
+            return
+        self._placement.relocalise(T_map_session, sigma_m)
+        if self._estimator is not None:
+            # They were found where the window is no more.
+            self._estimator.constraints = None
+            self._constraints_after_ns = self._estimator.recent_keyframes(1)[0]
+        self.counters.add("relocalisations")
+
+    @property
+    def is_located(self) -> bool:
+        """False between a loss and a relocalisation: where the window is in the map is a guess."""
+        return self._placement.is_located
 
     def add_scan(self, scan: LaserScan) -> None:
         """Take the stripe of one short frame."""
         if scan.session != self.session:
             self.counters.add("scans_of_other_sessions")
         elif self._mode.uses_laser and len(scan):
+            self._last_scan_ns = scan.stamp_ns
             (self._estimator or self._starter).add_scan(scan)
 
     def add_constraints(self, constraints: MapConstraints) -> None:
@@ -79,8 +119,10 @@ class BackEnd:
             self.counters.add("map_constraints_of_other_sessions")
         elif constraints.stamp_ns not in self._estimator.recent_keyframes(_CONSTRAINTS_AGE):
             self.counters.add("map_constraints_late")
+        elif constraints.stamp_ns <= self._constraints_after_ns:
+            self.counters.add("map_constraints_before_relocalisation")
         else:
-            self._estimator.constraints = constraints
+            self._estimator.constraints = self._placement.to_window(constraints)
 
     def add_frame(self, frame: FrontEndOutput) -> BackEndOutput:
         """Take the tracks and the preintegrated IMU of one long frame; return what is known of it."""
@@ -88,61 +130,119 @@ class BackEnd:
         if frame.tracks.session != self.session:
             self.counters.add("frames_of_other_sessions")
             return BackEndOutput(stamp, self.state, self.reason)
+        if frame.preintegration is not None:
+            self._last_imu_ns = stamp
         try:
             if self._estimator is None:
                 return self._start(frame)
             return self._track(frame, self._estimator)
         except SmootherError as error:
             self.counters.add("solver_failures")
-            return self._lose(stamp, f"solver failed: {error}")
+            return self._recover(stamp, str(error))
 
     def flush(self) -> WindowPoses | None:
         """Return everything still in the window as final (end of input, pause, reset)."""
-        window = self._estimator.flush(self.session) if self._estimator is not None else None
-        if window is not None:
-            self._restart(TrackingState.INITIALISING, "window flushed")
-        return window
+        if self._estimator is None:
+            return None
+        return self._end_window(TrackingState.INITIALISING, "window flushed")
 
     def _start(self, frame: FrontEndOutput) -> BackEndOutput:
-        self._estimator = self._starter.add_frame(frame, self._resume_pose)
-        if self._estimator is None:
-            if self.state is not TrackingState.LOST:
-                self.state = TrackingState.INITIALISING
+        stamp = frame.tracks.stamp_ns
+        self._reckoning.add_frame(frame)
+        estimator = self._starter.add_frame(frame, self._reckoning)
+        if estimator is None:
             self.reason = self._starter.reason
-            return BackEndOutput(frame.tracks.stamp_ns, self.state, self.reason)
+            return BackEndOutput(stamp, self.state, self.reason)
+        self._estimator = estimator
         self.counters.add("starts")
+        self._placement.guess(self._reckoning.sigma_m(stamp))
         self.state, self.reason = TrackingState.TRACKING, self._starter.reason
-        result = self._estimator.current(frame.tracks.stamp_ns, self.session)
-        return BackEndOutput(frame.tracks.stamp_ns, self.state, self.reason, result.pose, result.window, result.bias)
+        if not self._placement.is_located:
+            self.reason += f", {self._reckoning.elapsed_s(stamp):.1f} s after the loss"
+        self._last_good_ns = stamp
+        return self._output(stamp, estimator.current(stamp, self.session))
 
     def _track(self, frame: FrontEndOutput, estimator: WindowEstimator) -> BackEndOutput:
         stamp = frame.tracks.stamp_ns
         result = estimator.add_frame(frame, self.session)
         self.counters.add("keyframes", int(frame.tracks.keyframe))
         if result.landmarks >= self._config.min_landmarks:
-            self._degraded_since_ns = None
-            self.state, self.reason = TrackingState.TRACKING, ""
-        else:
-            since = self._degraded_since_ns = self._degraded_since_ns or stamp
-            self.state = TrackingState.DEGRADED
-            self.reason = f"{result.landmarks} features match the window, {self._config.min_landmarks} are needed"
-            if stamp - since > self._config.lost_after_s * 1e9:
-                return self._lose(stamp, self.reason)
-        return BackEndOutput(stamp, self.state, self.reason, result.pose, result.window, result.bias)
+            self._last_good_ns = stamp
+            self.state, self.reason = TrackingState.TRACKING, self._hint(stamp)
+            return self._output(stamp, result)
+        blind_s = (stamp - self._last_good_ns) / NANOSECONDS
+        carrier = "the IMU carries it" if frame.preintegration is not None else "nothing carries it"
+        self.state = TrackingState.DEGRADED
+        self.reason = (
+            f"{result.landmarks} features match the window, {self._config.min_landmarks} are needed: "
+            f"{carrier} for {blind_s:.1f} s"
+        )
+        if blind_s > self._config.lost_after_s:
+            return self._lose(stamp, f"too few features for {blind_s:.1f} s: covered lens, darkness or fast motion")
+        return self._output(stamp, result)
+
+    def _hint(self, stamp_ns: int) -> str:
+        """Return what is missing although it tracks, in words; empty where nothing is."""
+        silent = (
+            ("no laser for {:.1f} s: the landmarks hold the scale", self._mode.uses_laser, self._last_scan_ns),
+            ("no IMU for {:.1f} s: vision carries on without it", self._mode.uses_imu, self._last_imu_ns),
+        )
+        missing = [
+            text.format((stamp_ns - last) / NANOSECONDS) for text, used, last in silent if used and stamp_ns - last > _MISSING_NS
+        ]
+        return "; ".join([*missing, *filter(None, [self._placement.hint])])
+
+    def _output(self, stamp_ns: int, result: FrameResult) -> BackEndOutput:
+        pose = None if result.pose is None else self._placement.of_pose(result.pose)
+        window = None if result.window is None else self._placement.of_window(result.window)
+        return BackEndOutput(stamp_ns, self.state, self.reason, pose, window, result.bias)
 
     def _lose(self, stamp_ns: int, reason: str) -> BackEndOutput:
-        """Give up the window: what it holds becomes final, and a new one starts where it ended."""
+        """Give up the window: what it holds becomes final, and a new one starts where the IMU carries it."""
+        self.counters.add("lost")
+        window = self._end_window(TrackingState.LOST, reason)
+        return BackEndOutput(stamp_ns, self.state, reason, window=window)
+
+    def _recover(self, stamp_ns: int, problem: str) -> BackEndOutput:
+        """After a solver's failure go on with a new window from the newest keyframe; LOST where that fails again at once."""
+        estimator = self._estimator
+        if estimator is None or stamp_ns - self._last_failure_ns < _RECOVERY_NS:
+            return self._lose(stamp_ns, f"solver failed: {problem}")
+        self._last_failure_ns = stamp_ns
+        tracks, state = estimator.restart
+        window = estimator.flush(self.session)
+        config = self._config
+        prior = StatePrior(
+            np.full(3, config.tilt_sigma), 1e-6, _RESTART_VELOCITY, config.gyro_bias_sigma, config.accel_bias_sigma
+        )
+        depths = DepthPrior.of_scene(self._calibration, config)
+        try:
+            self._estimator = WindowEstimator(self._calibration, config, tracks, state, prior, estimator.scans, depths)
+        except SmootherError as error:
+            return self._lose(stamp_ns, f"solver failed: {error}")
+        self.counters.add("windows_renewed")
+        self.state, self.reason = TrackingState.DEGRADED, f"solver failed, the window begins anew: {problem}"
+        pose = self._estimator.current(stamp_ns, self.session).pose
+        return self._output(stamp_ns, FrameResult(pose, 0, window))
+
+    def _end_window(self, state: TrackingState, reason: str) -> WindowPoses | None:
         estimator = self._estimator
         window = None
         if estimator is not None:
             window = estimator.flush(self.session)
-            self._resume_pose = estimator.last_pose
-        self.counters.add("lost")
-        self._restart(TrackingState.LOST, reason)
-        return BackEndOutput(stamp_ns, self.state, reason, window=window)
-
-    def _restart(self, state: TrackingState, reason: str) -> None:
+            self._reckoning = DeadReckoning(*estimator.newest)
         self.state, self.reason = state, reason
+        self._wait_for_start()
+        return None if window is None else self._placement.of_window(window)
+
+    def _begin_map(self) -> None:
+        """Wait for the first start of a session: its place is the origin of the map."""
+        self._reckoning, self._placement = DeadReckoning(), Placement()
+        self._last_scan_ns, self._last_imu_ns = 0, 0
+        self._last_failure_ns = -_RECOVERY_NS
+        self._wait_for_start()
+
+    def _wait_for_start(self) -> None:
         self._estimator = None
         self._starter = self._new_starter(self._calibration, self._config, self._mode)
-        self._degraded_since_ns = None
+        self._last_good_ns, self._constraints_after_ns = 0, -1

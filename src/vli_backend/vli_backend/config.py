@@ -103,5 +103,7 @@ class BackEndConfig:
     min_landmarks: int = parameter(
         12, unit="features", minimum=5, maximum=200, doc="fewer in a frame: DEGRADED, the IMU carries it"
     )
-    lost_after_s: float = parameter(0.7, unit="s", minimum=0.05, maximum=10.0, doc="DEGRADED for longer is LOST")
+    lost_after_s: float = parameter(
+        1.0, unit="s", minimum=0.05, maximum=10.0, doc="without enough landmarks for longer: LOST; longer: the IMU drifts further"
+    )
     scene: SceneConfig = section(SceneConfig)

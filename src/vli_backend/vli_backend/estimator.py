@@ -86,6 +86,7 @@ class WindowEstimator:
 
         self._smoother.start(state, prior)
         self._state = state
+        self._candidate = first, state
         self._window.append(first.stamp_ns, first.stationary, None)
         self._add_observations(first)
         self._records = [FrameRecord(first.stamp_ns, state.T_map_imu @ self._T_imu_cam, first.stationary)]
@@ -97,10 +98,19 @@ class WindowEstimator:
         self._points = self._landmarks.points(self._keyframe_poses())
 
     @property
-    def last_pose(self) -> FloatArray:
-        """``T_map_imu`` (4, 4) of the newest frame."""
-        result: FloatArray = self._records[-1].T_map_camera @ self._T_cam_imu
-        return result
+    def newest(self) -> tuple[int, KeyframeState]:
+        """Stamp and state of the newest keyframe: where a new window or dead reckoning begins when this one ends."""
+        return self._window.stamps[-1], self._state
+
+    @property
+    def restart(self) -> tuple[Tracks, KeyframeState]:
+        """Tracks of the newest keyframe and its state before it was solved: what is left when the solver fails on it."""
+        return self._candidate
+
+    @property
+    def scans(self) -> list[LaserScan]:
+        """Stripes since the newest keyframe."""
+        return list(self._scans)
 
     def recent_keyframes(self, count: int) -> list[int]:
         """Return the stamps of the newest ``count`` keyframes."""
@@ -212,6 +222,7 @@ class WindowEstimator:
     ) -> FrameResult:
         T_odom_imu = inverse(self._T_map_odom) @ found.T_map_camera @ self._T_cam_imu
         state = KeyframeState(found.T_map_camera @ self._T_cam_imu, velocity, self._state.gyro_bias, self._state.accel_bias)
+        self._candidate = tracks, state
         self._append_keyframe(tracks, state, imu)
         moving = not tracks.stationary
         self._moving_keyframes += int(moving)

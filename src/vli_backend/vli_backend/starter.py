@@ -8,19 +8,20 @@ import gtsam
 import numpy as np
 
 from vli_backend.config import BackEndConfig
+from vli_backend.dead_reckoning import DeadReckoning
 from vli_backend.depth_prior import DepthPrior
 from vli_backend.estimator import WindowEstimator
 from vli_backend.initialisation import GRAVITY, align_imu, apply_alignment, rest_state
 from vli_backend.motion_start import structure_from_motion
 from vli_backend.smoother import KeyframeState, StatePrior
 from vli_backend.visual_start import start_from_vision
-from vli_common.arrays import FloatArray
 from vli_common.calibration import Calibration
-from vli_common.geometry import so3_log
+from vli_common.geometry import pose, so3_exp
 from vli_common.types import FrontEndOutput, LaserScan, Mode, Preintegration, Tracks
 
 _SCAN_MEMORY_NS = 4_000_000_000
 _MIN_FEATURES = 15
+_FRAMES_WITHOUT_IMU = 5
 _VISUAL_WINDOWS = 3
 """Window lengths over which a start without laser compares images and IMU: the longer, the better it knows the scale."""
 
@@ -46,6 +47,7 @@ class Starter:
         self._between: list[list[FrontEndOutput]] = []
         self._scans: list[LaserScan] = []
         self._moved = False
+        self._without_imu = 0
         self.reason = "waiting for the first keyframe"
 
     def add_scan(self, scan: LaserScan) -> None:
@@ -54,25 +56,26 @@ class Starter:
         while self._scans[-1].stamp_ns - self._scans[0].stamp_ns > _SCAN_MEMORY_NS:
             del self._scans[0]
 
-    def add_frame(self, frame: FrontEndOutput, T_map_imu: FloatArray) -> WindowEstimator | None:
+    def add_frame(self, frame: FrontEndOutput, place: DeadReckoning) -> WindowEstimator | None:
         """Take one long frame; return the started window, or None with :attr:`reason` saying why not yet.
 
         Args:
             frame: of the front end.
-            T_map_imu: (4, 4) where to start: position and heading of the new window.
+            place: position and heading of the new window.
         """
         tracks = frame.tracks
+        self._without_imu = self._without_imu + 1 if frame.preintegration is None and self._mode.uses_imu else 0
         self._keep(frame)
         self._moved |= not tracks.stationary
         if problem := self._missing(tracks):
             self.reason = problem
             return None
         if self._mode is Mode.VI:
-            return self._start_from_vision(T_map_imu) if tracks.keyframe else None
+            return self._start_from_vision(place) if tracks.keyframe else None
         if not self._moved or not self._mode.uses_imu:
-            return self._start_at_rest(frame, T_map_imu)
+            return self._start_at_rest(frame, place)
         if tracks.keyframe:
-            return self._start_in_motion(T_map_imu)
+            return self._start_in_motion(place)
         return None
 
     def _keep(self, frame: FrontEndOutput) -> None:
@@ -103,24 +106,28 @@ class Starter:
         if len(tracks) < _MIN_FEATURES:
             return f"only {len(tracks)} features, {_MIN_FEATURES} are needed: more texture, more light, or closer"
         if self._mode.uses_laser and not self._scans:
-            return "no laser stripe seen yet"
+            return "no laser stripe seen yet: is the laser on, and a surface within its range?"
+        if self._without_imu > _FRAMES_WITHOUT_IMU:
+            return "no IMU samples reach the frames: check the topic and the stamps of the IMU, or use --mode vl"
         return None
 
-    def _start_at_rest(self, frame: FrontEndOutput, T_map_imu: FloatArray) -> WindowEstimator | None:
+    def _start_at_rest(self, frame: FrontEndOutput, place: DeadReckoning) -> WindowEstimator | None:
         first = self._keyframes[-1].tracks
         if not self._mode.uses_imu:
-            return self._estimator(first, KeyframeState(T_map_imu, np.zeros(3), np.zeros(3), np.zeros(3)), 0.05)
+            return self._estimator(first, KeyframeState(place.at(first.stamp_ns), np.zeros(3), np.zeros(3), np.zeros(3)), 0.05)
         pim = _measurements(frame.preintegration)
         if pim is None or pim.deltaTij() < self._config.start_rest_s:
             self.reason = f"at rest, collecting IMU samples for {self._config.start_rest_s} s"
             return None
         self.reason = "started at rest"
-        return self._estimator(first, _placed(rest_state(pim), T_map_imu), 0.01)
+        return self._estimator(first, _placed([rest_state(pim)], place, first.stamp_ns)[0], 0.01)
 
-    def _start_in_motion(self, T_map_imu: FloatArray) -> WindowEstimator | None:
+    def _start_in_motion(self, place: DeadReckoning) -> WindowEstimator | None:
         config = self._config
         if len(self._keyframes) < config.start_min_keyframes:
-            self.reason = f"in motion, {len(self._keyframes)} of {config.start_min_keyframes} keyframes"
+            self.reason = (
+                f"in motion, {len(self._keyframes)} of {config.start_min_keyframes} keyframes that share features and IMU"
+            )
             return None
         tracks = [frame.tracks for frame in self._keyframes]
         imu = [pim for frame in self._keyframes[1:] if (pim := _measurements(frame.preintegration)) is not None]
@@ -132,7 +139,7 @@ class Starter:
         if abs(alignment.gravity_norm - GRAVITY) > 0.15 * GRAVITY:
             self.reason = f"in motion, gravity comes out as {alignment.gravity_norm:.1f} m/s²"
             return None
-        states = [_placed(state, T_map_imu) for state in apply_alignment(structure.T_world_imu, alignment)]
+        states = _placed(apply_alignment(structure.T_world_imu, alignment), place, tracks[0].stamp_ns)
         estimator = self._estimator(tracks[0], states[0], 0.1)
         for track, state, pim in zip(tracks[1:], states[1:], imu, strict=True):
             estimator.add_start_keyframe(track, state, pim)
@@ -140,7 +147,7 @@ class Starter:
         self.reason = "started in motion"
         return estimator
 
-    def _start_from_vision(self, T_map_imu: FloatArray) -> WindowEstimator | None:
+    def _start_from_vision(self, place: DeadReckoning) -> WindowEstimator | None:
         config = self._config
         if len(self._keyframes) < config.start_min_keyframes:
             self.reason = (
@@ -154,7 +161,8 @@ class Starter:
             self.reason = found.problem
             return None
         newest = slice(-config.window_keyframes, None)
-        tracks, states = tracks[newest], [_placed(state, T_map_imu) for state in found.states[newest]]
+        states = _placed(found.states, place, tracks[0].stamp_ns)[newest]
+        tracks = tracks[newest]
         estimator = self._estimator(tracks[0], states[0], 0.1, self._depths.around(found.median_depth))
         imu = [_measurements(frame.preintegration) for frame in self._keyframes[newest][1:]]
         for track, state, pim in zip(tracks[1:], states[1:], imu, strict=True):
@@ -171,14 +179,17 @@ class Starter:
         return WindowEstimator(self._calibration, config, tracks, state, prior, self._scans, depths or self._depths)
 
 
-def _placed(state: KeyframeState, T_map_imu: FloatArray) -> KeyframeState:
-    """Return the state moved to a position and heading; its tilt, which gravity gave, stays."""
-    heading = so3_log(T_map_imu[:3, :3])[2]
-    c, s = np.cos(heading), np.sin(heading)
-    turn = np.eye(4)
-    turn[:2, :2] = [[c, -s], [s, c]]
-    turn[:3, 3] = T_map_imu[:3, 3]
-    return KeyframeState(turn @ state.T_map_imu, turn[:3, :3] @ state.velocity, state.gyro_bias, state.accel_bias)
+def _placed(states: list[KeyframeState], place: DeadReckoning, stamp_ns: int) -> list[KeyframeState]:
+    """Return the states moved so that the first is where a place says, with its heading; tilt, which gravity gave, stays."""
+    if place.is_origin:
+        return states
+    T_map_imu, first = place.at(stamp_ns), states[0].T_map_imu
+    # The turn about z that brings one attitude nearest to the other.
+    a = first[:3, :3] @ T_map_imu[:3, :3].T
+    heading = np.arctan2(a[0, 1] - a[1, 0], a[0, 0] + a[1, 1])
+    turn = pose(so3_exp(np.array([0.0, 0.0, heading])), np.zeros(3))
+    turn[:3, 3] = T_map_imu[:3, 3] - turn[:3, :3] @ first[:3, 3]
+    return [KeyframeState(turn @ s.T_map_imu, turn[:3, :3] @ s.velocity, s.gyro_bias, s.accel_bias) for s in states]
 
 
 def _measurements(preintegration: Preintegration | None) -> gtsam.PreintegratedCombinedMeasurements | None:
