@@ -169,6 +169,8 @@ class Pipeline:
             with self.timer.measure("backend"):
                 output = self.stages.back_end.add_frame(frame)
             yield output
+            if output.pose is not None:
+                self.stages.front_end.add_pose(output.pose)
             if output.bias is not None:
                 self.stages.front_end.set_bias(output.bias)
             yield from self._map(output.window)

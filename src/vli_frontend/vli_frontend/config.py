@@ -127,6 +127,26 @@ class ImuConfig:
 
 
 @dataclass(frozen=True)
+class TimeShiftConfig:
+    """Online check of the camera–IMU time shift."""
+
+    online: bool = parameter(True, doc="correct a time shift that is certainly wrong; false: that of the calibration stays")
+    memory_s: float = parameter(
+        10.0, unit="s", minimum=1.0, maximum=600.0, doc="how long a pair of frames counts; longer: surer, corrects later"
+    )
+    least_s: float = parameter(
+        4.0e-4,
+        unit="s",
+        minimum=1.0e-5,
+        maximum=0.1,
+        doc="smaller errors are left alone; lower: also corrects what hardly matters",
+    )
+    largest_s: float = parameter(
+        0.04, unit="s", minimum=0.0, maximum=1.0, doc="farthest from the calibration that a correction may lead"
+    )
+
+
+@dataclass(frozen=True)
 class FrontEndConfig:
     """Features, keyframes and preintegration."""
 
@@ -147,3 +167,4 @@ class FrontEndConfig:
     detection: DetectionConfig = section(DetectionConfig)
     keyframe: KeyframeConfig = section(KeyframeConfig)
     imu: ImuConfig = section(ImuConfig)
+    time_shift: TimeShiftConfig = section(TimeShiftConfig)

@@ -8,13 +8,25 @@ from vli_common.arrays import FloatArray
 from vli_common.calibration import Calibration
 from vli_common.errors import CalibrationError
 from vli_common.geometry import so3_exp
-from vli_common.types import NANOSECONDS, Counters, FrontEndOutput, Image, ImuBias, ImuSample, LaserScan, Mode, Tracks
+from vli_common.types import (
+    NANOSECONDS,
+    Counters,
+    FrontEndOutput,
+    Image,
+    ImuBias,
+    ImuSample,
+    LaserScan,
+    Mode,
+    PoseEstimate,
+    Tracks,
+)
 from vli_frontend.config import FrontEndConfig
 from vli_frontend.keyframes import FrameVerdict, KeyframeRule
 from vli_frontend.photometry import make_frame
 from vli_frontend.preintegration import Preintegrator
 from vli_frontend.stripe_distance import StripeDistance
 from vli_frontend.synchroniser import ImuSegment, ReadyFrame, Synchroniser, seconds_to_ns
+from vli_frontend.time_shift import TimeShiftMonitor
 from vli_frontend.tracker import Tracker
 
 
@@ -36,6 +48,7 @@ class FrontEnd:
         wait_ns = seconds_to_ns(config.imu.max_wait_s)
         self._synchroniser = Synchroniser(calibration.timeshift_ns, wait_ns, mode.uses_imu, self.counters)
         self._preintegrator = self._make_preintegrator() if mode.uses_imu else None
+        self._time_shift = TimeShiftMonitor(config.time_shift)
         self._tracker = Tracker(calibration.camera, config, self.counters)
         self._keyframes = KeyframeRule(config.keyframe, calibration.camera.focal_px, mode.uses_laser)
         # Long and short frames alternate: 1.5 frame periods reach the neighbour, and no farther one where the rhythm jitters.
@@ -54,6 +67,7 @@ class FrontEnd:
         self._tracker.reset()
         self._keyframes.reset()
         self._stripes.clear()
+        self._time_shift.reset()
         self._previous_ns, self._gyro_bias, self._rotation_since_keyframe = None, np.zeros(3), None
 
     def set_bias(self, bias: ImuBias) -> None:
@@ -63,6 +77,34 @@ class FrontEnd:
             return
         self._gyro_bias = bias.gyro
         self._preintegrator.set_bias(bias)
+
+    def add_pose(self, pose: PoseEstimate) -> None:
+        """Take the live pose of a frame, from the back end: its rotation against the gyroscope's tells the time shift."""
+        if pose.session != self._session or not (self._mode.uses_imu and self._config.time_shift.online):
+            return
+        previous_ns = self._time_shift.previous_ns(pose.stamp_ns)
+        segment = None if previous_ns is None else self._synchroniser.segment(previous_ns, pose.stamp_ns)
+        if segment is not None and segment.longest_gap_ns > seconds_to_ns(self._config.imu.interpolated_gap_s):
+            segment = None
+        # In odom, which no keyframe makes step.
+        R_odom_imu = pose.T_map_odom[:3, :3].T @ pose.T_map_imu[:3, :3]
+        self._time_shift.add(pose.stamp_ns, R_odom_imu, segment)
+
+    @property
+    def timeshift_ns(self) -> int:
+        """The camera–IMU time shift in use: that of the calibration, as corrected."""
+        return self._synchroniser.timeshift_ns
+
+    @property
+    def hint(self) -> str:
+        """What to change in the calibration, in words; empty where nothing is wrong."""
+        wrong_ns = self.timeshift_ns - self._calibration.timeshift_ns
+        if wrong_ns == 0:
+            return ""
+        return (
+            f"the camera's clock is {wrong_ns * 1e-6:+.1f} ms off the calibration and is corrected; "
+            f"set cam0.timeshift_cam_imu to {self.timeshift_ns / NANOSECONDS:.4f}"
+        )
 
     def add_scan(self, scan: LaserScan) -> None:
         """Take the stripe of a short frame."""
@@ -142,11 +184,23 @@ class FrontEnd:
         return verdict
 
     def _begin_interval(self, stamp_ns: int, stationary: bool) -> None:
+        self._correct_time_shift()
         tracks = self._tracker.tracks
         self._keyframes.accept(stamp_ns, stationary, tracks.ids, tracks.rays)
         self._rotation_since_keyframe = np.eye(3)
         if self._preintegrator is not None:
             self._preintegrator.start(stamp_ns)
+
+    def _correct_time_shift(self) -> None:
+        """Change the time shift, at a keyframe only: within an interval all measurements share one clock."""
+        correction_ns = seconds_to_ns(self._time_shift.correction_s())
+        if correction_ns == 0:
+            return
+        largest_ns = seconds_to_ns(self._config.time_shift.largest_s)
+        wanted_ns = self.timeshift_ns + correction_ns - self._calibration.timeshift_ns
+        self._synchroniser.timeshift_ns = self._calibration.timeshift_ns + max(-largest_ns, min(largest_ns, wanted_ns))
+        self._time_shift.reset()
+        self.counters.add("time_shift_corrections")
 
     def _tracks(self, stamp_ns: int, verdict: FrameVerdict) -> Tracks:
         """Return the tracks as they are now; nothing in it changes later."""

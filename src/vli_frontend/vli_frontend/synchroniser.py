@@ -123,7 +123,9 @@ class Synchroniser:
 
     def __init__(self, timeshift_ns: int, max_wait_ns: int, uses_imu: bool, counters: Counters) -> None:
         self.imu = ImuHistory()
-        self._timeshift_ns, self._max_wait_ns, self._uses_imu = timeshift_ns, max_wait_ns, uses_imu
+        self.timeshift_ns = timeshift_ns
+        """May be changed at any time; holds for what is asked from then on."""
+        self._max_wait_ns, self._uses_imu = max_wait_ns, uses_imu
         self._counters = counters
         self._waiting: deque[Image] = deque()
         self._newest_frame_ns: int | None = None
@@ -174,7 +176,7 @@ class Synchroniser:
 
     def to_imu_clock(self, stamp_ns: int) -> int:
         """Return a camera stamp on the clock of the IMU."""
-        return stamp_ns + self._timeshift_ns
+        return stamp_ns + self.timeshift_ns
 
     def segment(self, begin_ns: int, end_ns: int) -> ImuSegment | None:
         """Return the IMU between two camera stamps, or None where it does not cover them."""

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+
+from nav_msgs.msg import Odometry
 
 from vli_common.calibration import Calibration
 from vli_common.config import parameter
@@ -13,13 +15,15 @@ from vli_common.messages import (
     image_from_message,
     imu_from_message,
     no_preintegration_message,
+    odometry_from_message,
     preintegration_to_message,
     scan_from_message,
     tracks_to_message,
 )
 from vli_common.node import VliNode, run_node
-from vli_common.topics import BIAS, IMAGE_LONG, IMU, LASER_POINTS, PREINTEGRATION, TRACKS
-from vli_common.types import Counters, FrontEndOutput, Image, ImuBias, ImuSample, LaserScan
+from vli_common.status import Health
+from vli_common.topics import BIAS, IMAGE_LONG, IMU, LASER_POINTS, ODOMETRY, PREINTEGRATION, TRACKS
+from vli_common.types import Counters, FrontEndOutput, Image, ImuBias, ImuSample, LaserScan, PoseEstimate
 from vli_frontend.config import FrontEndConfig
 from vli_frontend.frontend import FrontEnd
 from vli_frontend.warm_up import warm_up
@@ -45,12 +49,17 @@ class FrontEndNode(VliNode):
         self.receive(LASER_POINTS, scan_from_message, self._on_scan)
         self.receive(IMAGE_LONG, lambda message: image_from_message(message, self.session), self._on_image)
         self.receive(BIAS, lambda message: bias_from_message(message, self.session), self._on_bias, ends=False)
+        self.receive(ODOMETRY, self._to_pose, self._on_pose, ends=False)
 
     def create_stage(self, calibration: Calibration | None) -> None:
         """Make the front end."""
         if calibration is not None:
             warm_up()
             self._front_end = FrontEnd(calibration, self.parameters.config(FrontEndConfig), self.mode)
+
+    def drop_stage(self) -> None:
+        """Let go of the front end."""
+        self._front_end = None
 
     def on_session(self, session: Session) -> None:
         """Begin a session."""
@@ -59,6 +68,13 @@ class FrontEndNode(VliNode):
     def stage_counters(self) -> Counters:
         """Return the counters of the front end."""
         return self._front_end.counters if self._front_end else Counters()
+
+    def stage_status(self) -> tuple[Health, str, dict[str, str]]:
+        """Return a warning where the calibration's time shift is wrong."""
+        if self._front_end is None:
+            return Health.OK, "", {}
+        hint = self._front_end.hint
+        return Health.WARN if hint else Health.OK, hint, {"timeshift_ns": str(self._front_end.timeshift_ns)}
 
     @property
     def front_end(self) -> FrontEnd:
@@ -76,6 +92,12 @@ class FrontEndNode(VliNode):
 
     def _on_bias(self, bias: ImuBias) -> None:
         self.front_end.set_bias(bias)
+
+    def _to_pose(self, message: Odometry) -> PoseEstimate:
+        return replace(odometry_from_message(message), session=self.session)
+
+    def _on_pose(self, pose: PoseEstimate) -> None:
+        self.front_end.add_pose(pose)
 
     def _emit(self, frames: list[FrontEndOutput]) -> None:
         for frame in frames:
