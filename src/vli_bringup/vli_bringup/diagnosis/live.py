@@ -103,10 +103,8 @@ def _topic_findings(publishers: dict[str, list[Any]], heard: Heard, image: str, 
     for name, found in publishers.items():
         lossy = [item.node_name for item in found if item.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT]
         if lossy:
-            text = (
-                f"'{name}' is published as best effort by {', '.join(lossy)}; the nodes ask for reliable and would hear nothing"
-            )
-            findings.append(Finding(Level.PROBLEM, "topics", text))
+            text = f"'{name}' is published as best effort by {', '.join(lossy)}: messages may be lost; publish reliably"
+            findings.append(Finding(Level.WARNING, "topics", text))
     return findings
 
 
