@@ -186,7 +186,7 @@ def sheet_stripe(row: int, count: int, start: int, number: int, rng: np.random.G
     return Stripe(
         stamp_ns=number * 33_333_333,
         number=number,
-        viewpoint=points.mean(axis=0) + np.array([0, 0, 0.03]),
+        T_map_camera=looking_down(points.mean(axis=0) + np.array([0, 0, 0.03])),
         points=points,
         normals=np.zeros((count, 3), np.float32),
         planarity=np.zeros(count, np.float32),
@@ -194,6 +194,13 @@ def sheet_stripe(row: int, count: int, start: int, number: int, rng: np.random.G
         sigma=np.full(count, 5e-5),
         solid=np.ones(count, np.bool_),
     )
+
+
+def looking_down(centre: FloatArray) -> FloatArray:
+    """Return T_map_camera (4, 4) of a camera at ``centre`` (3,) that looks along −z of map."""
+    T = np.diag([1.0, -1.0, -1.0, 1.0])
+    T[:3, 3] = centre
+    return T
 
 
 def resident_mb() -> float:

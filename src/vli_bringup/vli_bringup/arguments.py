@@ -8,6 +8,7 @@ from pathlib import Path
 from vli_bringup.settings import Settings, load_settings
 from vli_common.types import Mode
 from vli_driver.bag import BagTopics
+from vli_mapping.config import AS_SEEN, COMPENSATED
 
 _TOPICS = {"image": "image_topic", "imu": "imu_topic", "camera_info": "camera_info_topic", "exposure": "exposure_topic"}
 """Name after ``--topic`` → parameter of the driver."""
@@ -29,6 +30,9 @@ def add_scan_arguments(parser: argparse.ArgumentParser) -> None:
 def add_source_arguments(parser: argparse.ArgumentParser) -> None:
     """Add Kalibr's IMU file, parameters, and the choice of topics and time."""
     parser.add_argument("--imu-calib", metavar="F", type=Path, help="Kalibr's separate IMU file")
+    parser.add_argument(
+        "--colour", choices=(COMPENSATED, AS_SEEN), help="of the map: without the light on board (default), or as seen"
+    )
     parser.add_argument("--config", metavar="F", type=Path, help="parameters, in the form of config/vli.yaml")
     parser.add_argument("--set", metavar="STAGE.KEY=VALUE", action="append", default=[], help="one parameter; may be repeated")
     parser.add_argument("--start", metavar="S", type=_seconds, default=0.0, help="skip the first S seconds")
@@ -39,13 +43,14 @@ def add_source_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def source_settings(args: argparse.Namespace) -> Settings:
-    """Return the settings that ``--config``, ``--set`` and ``--topic`` ask for, the later ones first in rank.
+    """Return the settings that ``--config``, ``--set``, ``--colour`` and ``--topic`` ask for, the later ones first in rank.
 
     Raises:
         ConfigError: unknown names or invalid values, all of them at once.
     """
+    colour = [f"mapping.colour={args.colour}"] if args.colour else []
     topics = [f"driver.{_TOPICS[name]}={topic}" for name, topic in args.topic]
-    return load_settings(args.config, [*args.set, *topics])
+    return load_settings(args.config, [*args.set, *colour, *topics])
 
 
 def bag_topics(settings: Settings, mode: Mode) -> BagTopics:

@@ -107,7 +107,7 @@ def process(reader: BagReader, pipeline: Pipeline, recorder: Recorder, duration_
 def write(directory: Path, pipeline: Pipeline, recorder: Recorder, clock: Clock, settings: Settings) -> None:
     """Write trajectories, map, picture, times, parameters and summary."""
     recorder.write(directory)
-    cloud = pipeline.stages.mapper.map.cloud()
+    cloud = pipeline.stages.mapper.cloud()
     write_ply(directory / "map.ply", cloud)
     write_views(directory / "cloud.png", cloud)
     pipeline.timer.write(directory / "timing.csv")

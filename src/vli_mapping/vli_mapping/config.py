@@ -6,6 +6,9 @@ from dataclasses import dataclass
 
 from vli_common.config import parameter, section
 
+COMPENSATED, AS_SEEN = "compensated", "lit"
+"""Values of ``colour``."""
+
 
 @dataclass(frozen=True)
 class MapConfig:
@@ -149,6 +152,11 @@ class MappingConfig:
     map: MapConfig = section(MapConfig)
     entry: EntryConfig = section(EntryConfig)
     association: AssociationConfig = section(AssociationConfig)
+    colour: str = parameter(
+        COMPENSATED,
+        choices=(COMPENSATED, AS_SEEN),
+        doc="colours without the light that travels with the camera, so that passes do not band, or as seen",
+    )
     image_buffer_s: float = parameter(
         10.0,
         unit="s",

@@ -9,6 +9,8 @@ from vli_mapping.spatial_hash import bucket_of, cell_of, link_one, unlink_one
 
 ROWS, FREE_HEAD, FREE = 0, 1, 2
 """Of the state (3,): rows in use, first of the chain of free rows among them (−1: none), and how many these are."""
+VISIT_SCANS = 15
+"""Scans apart, half a second, up to which two colours of a point are averaged."""
 
 
 @njit(cache=True, nogil=True)
@@ -24,7 +26,7 @@ def insert_stripe(heads, following, cell_m, state, columns, stripe, number, stam
         limits: merge radius, cosine of the merge angle, merge colour, cap on the weight, fill radius.
         target: the answer.
     """
-    position, solid = columns[0], columns[8]
+    position, solid = columns[0], columns[9]
     points, stripe_solid = stripe[0], stripe[5]
     merge_radius, fill_radius = limits[0], limits[4]
     for wanted in (True, False):
@@ -37,7 +39,7 @@ def insert_stripe(heads, following, cell_m, state, columns, stripe, number, stam
                 continue
             at = _nearest_compatible(heads, following, cell_m, columns, p, stripe, index, merge_radius, limits)
             if at >= 0:
-                _merge(heads, following, cell_m, at, columns, stripe, index, limits[3])
+                _merge(heads, following, cell_m, at, columns, stripe, index, number, limits[3])
             else:
                 if wanted:
                     _drop_doubtful(heads, following, cell_m, state, columns, p, fill_radius)
@@ -48,7 +50,7 @@ def insert_stripe(heads, following, cell_m, state, columns, stripe, number, stam
 @njit(cache=True, nogil=True)
 def _add(heads, following, cell_m, state, columns, stripe, index, number, stamp_ns):  # type: ignore[no-untyped-def]
     """Write a point into a row that is free, else into a new one; return the row."""
-    position, normal, colour, weight, sigma, planarity, scan, entered_ns, solid = columns
+    position, normal, colour, weight, sigma, planarity, scan, seen_by, entered_ns, solid = columns
     points, normals, colours, sigmas, planarities, stripe_solid = stripe
     at = state[FREE_HEAD]
     if at >= 0:
@@ -64,6 +66,7 @@ def _add(heads, following, cell_m, state, columns, stripe, index, number, stamp_
     sigma[at] = sigmas[index]
     planarity[at] = planarities[index]
     scan[at] = number
+    seen_by[at] = number
     entered_ns[at] = stamp_ns
     solid[at] = stripe_solid[index]
     link_one(heads, following, at, position[at], cell_m)
@@ -87,7 +90,7 @@ def _covered(heads, following, cell_m, position, solid, p, radius):  # type: ign
 @njit(cache=True, nogil=True)
 def _drop_doubtful(heads, following, cell_m, state, columns, p, radius):  # type: ignore[no-untyped-def]
     """Let the doubtful points within ``radius`` of ``p`` leave: their rows are free."""
-    position, weight, solid = columns[0], columns[3], columns[8]
+    position, weight, solid = columns[0], columns[3], columns[9]
     for i in range(cell_of(p[0] - radius, cell_m), cell_of(p[0] + radius, cell_m) + 1):
         for j in range(cell_of(p[1] - radius, cell_m), cell_of(p[1] + radius, cell_m) + 1):
             for k in range(cell_of(p[2] - radius, cell_m), cell_of(p[2] + radius, cell_m) + 1):
@@ -112,7 +115,7 @@ def squared_distance(a, b):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _nearest_compatible(heads, following, cell_m, columns, p, stripe, index, radius, limits):  # type: ignore[no-untyped-def]
     """Return the row of the nearest point, as solid as the stripe's, that agrees in normal and colour; −1 where there is none."""
-    position, normal, colour, solid = columns[0], columns[1], columns[2], columns[8]
+    position, normal, colour, solid = columns[0], columns[1], columns[2], columns[9]
     n, c, wanted = stripe[1][index], stripe[2][index], stripe[5][index]
     best = np.int64(-1)
     nearest = radius * radius
@@ -150,9 +153,10 @@ def colours_agree(a, b, limit):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _merge(heads, following, cell_m, at, columns, stripe, index, max_weight):  # type: ignore[no-untyped-def]
+def _merge(heads, following, cell_m, at, columns, stripe, index, number, max_weight):  # type: ignore[no-untyped-def]
     """Average point ``index`` of a stripe into row ``at``."""
     position, normal, colour, weight, sigma = columns[:5]
+    seen_by = columns[7]
     p, n, c, sigma_new = stripe[0][index], stripe[1][index], stripe[2][index], stripe[3][index]
     old_information, new_information = 1.0 / np.float64(sigma[at]) ** 2, 1.0 / np.float64(sigma_new) ** 2
     gain = new_information / (old_information + new_information)
@@ -168,11 +172,7 @@ def _merge(heads, following, cell_m, at, columns, stripe, index, max_weight):  #
         link_one(heads, following, at, moved, cell_m)
     share = 1.0 / (weight[at] + 1.0)
     _blend_normal(normal[at], n, share)
-    for channel in range(3):
-        if np.isnan(colour[at, channel]):
-            colour[at, channel] = c[channel]
-        elif not np.isnan(c[channel]):
-            colour[at, channel] += share * (c[channel] - colour[at, channel])
+    _blend_colour(colour[at], c, share, seen_by, at, number)
     information = old_information + new_information
     merged = weight[at] + 1.0
     if merged > max_weight:
@@ -180,6 +180,22 @@ def _merge(heads, following, cell_m, at, columns, stripe, index, max_weight):  #
         merged = max_weight
     weight[at] = merged
     sigma[at] = 1.0 / np.sqrt(information)
+
+
+@njit(cache=True, nogil=True)
+def _blend_colour(colour, c, share, seen_by, at, number):  # type: ignore[no-untyped-def]
+    """Turn a colour (3,), in place, towards ``c`` by ``share``, where both are of one visit; an unknown one takes the other.
+
+    The light moves with the camera: the mean of two visits is what neither saw, and no one light can be taken out of it.
+    """
+    if np.isnan(c[0]):
+        return
+    if np.isnan(colour[0]):
+        colour[:] = c
+        seen_by[at] = number
+    elif number - seen_by[at] <= VISIT_SCANS:
+        for channel in range(3):
+            colour[channel] += share * (c[channel] - colour[channel])
 
 
 @njit(cache=True, nogil=True)

@@ -8,7 +8,8 @@ from vli_common.arrays import FloatArray, IntArray
 from vli_common.calibration import Calibration
 from vli_common.types import Counters, Image, LaserScan, MappingOutput, Mode, PointCloud, WindowPoses
 from vli_mapping.association import associate
-from vli_mapping.config import MappingConfig
+from vli_mapping.config import AS_SEEN, MappingConfig
+from vli_mapping.light import Light, LightEstimator
 from vli_mapping.point_map import PointMap, Stripe, to_bytes
 from vli_mapping.scan_window import PosedScan, ScanWindow
 
@@ -34,6 +35,7 @@ class Mapper:
         self._uses_laser = mode.uses_laser
         self._window = ScanWindow(calibration.camera, self.config, self.counters)
         self._unrefined: list[tuple[IntArray, FloatArray]] = []
+        self._light = LightEstimator()
 
     def add_image(self, image: Image) -> None:
         """Take a long image, for colour."""
@@ -60,8 +62,23 @@ class Mapper:
             constraints = associate(self.map, staying, window.stamp_ns, self.config.association, self.counters, session)
         cloud = _live_cloud(self._window.unpublished(), window.stamp_ns, session)
         self._window.release(window)
-        update = self.map.cloud(touched, window.stamp_ns, session) if len(touched) else None
+        update = (
+            self.map.cloud(touched, window.stamp_ns, session, self._light.latest, self.config.colour == AS_SEEN)
+            if len(touched)
+            else None
+        )
         return MappingOutput(constraints, cloud, update)
+
+    def cloud(self, max_points: int | None = None, stamp_ns: int = 0, session: int = 0) -> PointCloud:
+        """Return the map, thinned to ``max_points`` where given; colours as the config asks for."""
+        light, as_seen = self.light(), self.config.colour == AS_SEEN
+        if max_points is None:
+            return self.map.cloud(None, stamp_ns, session, light, as_seen)
+        return self.map.thinned(max_points, stamp_ns, session, light, as_seen)
+
+    def light(self) -> Light | None:
+        """Return the light on board and the lens as all scans so far tell of them; None while they tell too little."""
+        return self._light.fit()
 
     def reset(self, session: int) -> None:
         """Drop all that belongs to another session, and start a new map: poses of two sessions share no frame.
@@ -72,10 +89,12 @@ class Mapper:
         if len(self.map):
             self.map = PointMap(self.config.map)
         self._unrefined.clear()
+        self._light = LightEstimator()
         self._window = self._window.successor(session)
 
     def _enter_leaving(self) -> IntArray:
         """Enter the scans that leave the window; return the map points they became or joined, ascending."""
+        self._light.add(self._window.sightings())
         touched = [np.empty(0, np.int64), *(self._enter(item) for item in self._window.leaving())]
         return self.map.alive(np.unique(np.concatenate(touched)))
 
@@ -103,7 +122,7 @@ def _stripe(item: PosedScan) -> Stripe:
     return Stripe(
         stamp_ns=item.scan.stamp_ns,
         number=item.number,
-        viewpoint=item.viewpoint,
+        T_map_camera=item.T_map_camera,
         points=item.points[use],
         normals=item.map_normals[use],
         planarity=item.planarity[use],

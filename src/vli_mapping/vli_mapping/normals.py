@@ -81,6 +81,31 @@ def _fit_normals(  # type: ignore[no-untyped-def]
             normals[index, axis] = sign * plane[3 + axis] if good else 0.0
 
 
+def smooth_normals(
+    grid: SpatialHash, positions: FloatArray, normals: Float32Array, which: IntArray, radius: float
+) -> Float32Array:
+    """Return the normals (K, 3) of points ``which``; where one is unknown, the mean of those within ``radius``, 0 without any."""
+    result = normals[which]
+    _fill_normals(grid.heads, grid.next, positions, grid.cell_m, normals, which, radius, result)
+    return result
+
+
+@njit(cache=True, nogil=True)
+def _fill_normals(heads, following, positions, cell_m, normals, which, radius, result):  # type: ignore[no-untyped-def]
+    found = np.empty(MAX_NEIGHBOURS, np.int64)
+    for index in range(len(which)):
+        if result[index, 0] != 0 or result[index, 1] != 0 or result[index, 2] != 0:
+            continue
+        count = neighbours(heads, following, positions, positions[which[index]], radius, cell_m, found)
+        norm = 0.0
+        for axis in range(3):
+            for at in found[:count]:
+                result[index, axis] += normals[at, axis]
+            norm += result[index, axis] ** 2
+        if norm > 0:
+            result[index] /= np.sqrt(norm)
+
+
 @njit(cache=True, nogil=True)
 def fit_plane(positions, which, origin, plane):  # type: ignore[no-untyped-def]
     """Fit a plane to points ``which`` (K,) of ``positions``; sums are taken about ``origin`` (3,).

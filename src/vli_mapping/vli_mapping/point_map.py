@@ -10,7 +10,8 @@ from vli_common.arrays import AnyArray, BoolArray, ByteArray, Float32Array, Floa
 from vli_common.types import PointCloud
 from vli_mapping.config import MapConfig
 from vli_mapping.insertion import FREE, ROWS, insert_stripe
-from vli_mapping.normals import refine_normals
+from vli_mapping.light import Light
+from vli_mapping.normals import refine_normals, smooth_normals
 from vli_mapping.spatial_hash import NONE, SpatialHash
 from vli_mapping.thinning import thin
 
@@ -32,6 +33,7 @@ class Columns:
         sigma: (N,) float32, metres, one standard deviation of the averaged position along the viewing ray.
         planarity: (N,) float32, see ``normals``.
         scan: (N,) int32, number of the scan that brought the point.
+        seen_by: (N,) int32, number of the scan whose long images gave the colour.
         entered_ns: (N,) int64, its stamp.
         solid: (N,) bool, False for a point that stays only until something better covers its place.
     """
@@ -43,6 +45,7 @@ class Columns:
     sigma: Float32Array
     planarity: Float32Array
     scan: Int32Array
+    seen_by: Int32Array
     entered_ns: IntArray
     solid: BoolArray
 
@@ -57,6 +60,7 @@ class Columns:
             np.empty(capacity, narrow),
             np.empty(capacity, narrow),
             np.empty(capacity, narrow),
+            np.empty(capacity, np.int32),
             np.empty(capacity, np.int32),
             np.empty(capacity, np.int64),
             np.empty(capacity, np.bool_),
@@ -78,7 +82,7 @@ class Stripe:
     Args:
         stamp_ns: of the scan.
         number: counts the scans of the session, ascending.
-        viewpoint: (3,), camera centre in map.
+        T_map_camera: (4, 4), its pose.
         points: (N, 3), map, metres.
         normals: (N, 3) float32, 0 = none.
         planarity: (N,) float32.
@@ -89,7 +93,7 @@ class Stripe:
 
     stamp_ns: int
     number: int
-    viewpoint: FloatArray
+    T_map_camera: FloatArray
     points: FloatArray
     normals: Float32Array
     planarity: Float32Array
@@ -100,13 +104,19 @@ class Stripe:
     def __len__(self) -> int:
         return len(self.points)
 
+    @property
+    def viewpoint(self) -> FloatArray:
+        """Camera centre (3,) in map."""
+        viewpoint: FloatArray = self.T_map_camera[:3, 3]
+        return viewpoint
+
 
 class PointMap:
     """Points that merge with near ones of compatible colour and normal, else are added.
 
-    Positions are averaged by their sigmas, colours and normals by weight; the weight is capped, so that a point goes on
-    following. Doubtful points only fill what no solid point covers, and leave when one does: the rows of points that left
-    (weight 0) are used again.
+    Positions are averaged by their sigmas, normals by weight, colours too within one visit; the weight is capped, so that a
+    point goes on following. Doubtful points only fill what no solid point covers, and leave when one does: the rows of points
+    that left (weight 0) are used again.
 
     Args:
         config: see :class:`MapConfig`.
@@ -117,6 +127,8 @@ class PointMap:
         self.config = config or MapConfig()
         self.columns = Columns.empty(capacity)
         self.grid = SpatialHash(CELL_M, capacity)
+        self.views: FloatArray = np.zeros((0, 3, 4))
+        """(S, 3, 4), pose of the camera in map by the number of the scan."""
         self._state = np.array([0, NONE, 0], np.int64)
         c = self.config
         self._limits = (
@@ -142,13 +154,14 @@ class PointMap:
         """Take a stripe, solid points first; return the row (N,) each point became or joined, −1 where it was not needed."""
         self._reserve(self.rows + len(stripe))
         c = self.columns
+        self._keep_view(stripe)
         target = np.empty(len(stripe), np.int64)
         insert_stripe(
             self.grid.heads,
             self.grid.next,
             CELL_M,
             self._state,
-            (c.position, c.normal, c.colour, c.weight, c.sigma, c.planarity, c.scan, c.entered_ns, c.solid),
+            (c.position, c.normal, c.colour, c.weight, c.sigma, c.planarity, c.scan, c.seen_by, c.entered_ns, c.solid),
             (stripe.points, stripe.normals, stripe.colours, stripe.sigma, stripe.planarity, stripe.solid),
             stripe.number,
             stripe.stamp_ns,
@@ -164,20 +177,56 @@ class PointMap:
             self.grid, c.position, self.alive(which), viewpoint, config.normal_radius, config.min_planarity, c.normal, c.planarity
         )
 
-    def cloud(self, which: IntArray | None = None, stamp_ns: int = 0, session: int = 0) -> PointCloud:
-        """Return the map, or rows ``which`` of it, as a cloud of its own memory."""
+    def cloud(
+        self,
+        which: IntArray | None = None,
+        stamp_ns: int = 0,
+        session: int = 0,
+        light: Light | None = None,
+        as_seen: bool = False,
+    ) -> PointCloud:
+        """Return the map, or rows ``which`` of it, as a cloud of its own memory; see ``shown_colours``."""
         which = self.alive() if which is None else which
         c = self.columns
-        return PointCloud(
-            stamp_ns, c.position[which].astype(np.float32), to_bytes(c.colour[which]), c.normal[which], c.weight[which], session
-        )
+        colours = to_bytes(self.shown_colours(which, light, as_seen))
+        return PointCloud(stamp_ns, c.position[which].astype(np.float32), colours, c.normal[which], c.weight[which], session)
 
-    def thinned(self, max_points: int, stamp_ns: int = 0, session: int = 0) -> PointCloud:
+    def thinned(
+        self, max_points: int, stamp_ns: int = 0, session: int = 0, light: Light | None = None, as_seen: bool = False
+    ) -> PointCloud:
         """Return at most ``max_points``: the heaviest point of each voxel, the voxel as small as that allows."""
         which = self.alive()
         if len(which) > max_points:
             which = which[thin(self.columns.position[which], self.columns.weight[which], max_points)]
-        return self.cloud(which, stamp_ns, session)
+        return self.cloud(which, stamp_ns, session, light, as_seen)
+
+    def shown_colours(self, which: IntArray, light: Light | None, as_seen: bool) -> Float32Array:
+        """Return the colours (K, 3) of rows ``which``, NaN = unknown.
+
+        Args:
+            which: rows.
+            light: None leaves the colours as they are in the images.
+            as_seen: take out only what the lens does to the light, not what the light does to the surface.
+        """
+        c = self.columns
+        if light is None or not len(which):
+            return c.colour[which]
+        view = self.views[c.seen_by[which]]
+        points = np.einsum("nji,nj->ni", view[:, :, :3], c.position[which] - view[:, :, 3])
+        if as_seen:
+            gain = light.vignette(points)
+        else:
+            normals = smooth_normals(self.grid, c.position, c.normal, which, self.config.normal_radius)
+            gain = light.shading(points, np.einsum("nji,nj->ni", view[:, :, :3], normals))
+        result: Float32Array = (c.colour[which] / gain[:, None]).astype(np.float32)
+        return result
+
+    def _keep_view(self, stripe: Stripe) -> None:
+        if stripe.number >= len(self.views):
+            grown = np.zeros((max(2 * len(self.views), stripe.number + 1, 256), 3, 4))
+            grown[: len(self.views)] = self.views
+            self.views = grown
+        self.views[stripe.number] = stripe.T_map_camera[:3]
 
     def _reserve(self, needed: int) -> None:
         if needed <= len(self.columns.weight):

@@ -12,12 +12,15 @@ from vli_common.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from vli_common.camera import CameraModel
 from vli_common.geometry import inverse, transform
 from vli_common.types import NANOSECONDS, Counters, FrameKind, Image, LaserScan, WindowPoses
-from vli_mapping.colour import colour_points
+from vli_mapping.colour import colour_points, sight
 from vli_mapping.config import MappingConfig
 from vli_mapping.entry import away_from_edges, facing, noisy, supported
+from vli_mapping.light import Sightings
 from vli_mapping.normals import stripe_normals
 
 Stamped = TypeVar("Stamped", Image, LaserScan)
+_SPOTS_PER_SCAN = 6
+"""Of the light: neighbours along a stripe say the same."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +108,7 @@ class ScanWindow:
         self._waiting: dict[int, LaserScan] = {}
         self._long_poses: dict[int, FloatArray] = {}
         self._scans: dict[int, PosedScan] = {}
+        self._keyframes: set[int] = set()
         self._last_final: PosedScan | None = None
         self._next_number = 0
 
@@ -154,6 +158,18 @@ class ScanWindow:
             item.published = True
         return fresh
 
+    def sightings(self) -> Sightings:
+        """Return how the keyframes' images show some spots of the scans that leave, from all over the field of view."""
+        points, normals = [np.empty((0, 3))], [np.empty((0, 3), np.float32)]
+        for item in self.leaving():
+            flat = np.flatnonzero(item.solid & item.normals.any(axis=1))
+            which = flat[:: max(len(flat) // _SPOTS_PER_SCAN, 1)]
+            points.append(item.points[which])
+            normals.append(item.map_normals[which])
+        stamps = sorted(stamp for stamp in self._keyframes if stamp in self._images and stamp in self._long_poses)
+        views = [(self._images[stamp].pixels, self._long_poses[stamp]) for stamp in stamps]
+        return sight(self._camera, np.concatenate(points), np.concatenate(normals), views)
+
     def release(self, window: WindowPoses) -> None:
         """Forget what no later window can ask for."""
         final = [item for item in self._scans.values() if item.final]
@@ -163,8 +179,10 @@ class ScanWindow:
             del self._scans[item.scan.stamp_ns]
         newest = int(window.stamps[-1]) if len(window) else window.stamp_ns
         oldest = newest - int(self._config.colour_gap_s * NANOSECONDS)
-        self._images = {stamp: item for stamp, item in self._images.items() if stamp >= oldest}
-        self._long_poses = {stamp: item for stamp, item in self._long_poses.items() if stamp >= oldest}
+        keyframes = (window.kinds == FrameKind.KEYFRAME.value) & ~window.final
+        self._keyframes = set(window.stamps[keyframes].tolist())
+        self._images = {stamp: item for stamp, item in self._images.items() if stamp >= oldest or stamp in self._keyframes}
+        self._long_poses = {stamp: T for stamp, T in self._long_poses.items() if stamp >= oldest or stamp in self._keyframes}
 
     def _useful(self) -> list[PosedScan]:
         return [self._scans[stamp] for stamp in sorted(self._scans) if not self._scans[stamp].redundant]

@@ -10,7 +10,7 @@ from vli_mapping.association import associate
 from vli_mapping.colour import colour_points
 from vli_mapping.config import AssociationConfig, EntryConfig, MapConfig
 from vli_mapping.entry import away_from_edges, facing, noisy, supported
-from vli_mapping.normals import stripe_normals
+from vli_mapping.normals import smooth_normals, stripe_normals
 from vli_mapping.point_map import PointMap, Stripe
 from vli_mapping.scan_window import PosedScan
 from vli_mapping.thinning import thin
@@ -27,8 +27,10 @@ def warm_up() -> None:
         normals, planarity = stripe_normals(row, row + step, limits.normal_radius, limits.min_planarity)
         solid = away_from_edges(row, sigma, entry) & supported(row, row, entry.support_radius) & facing(row, normals, 80.0)
         solid[::3] = ~noisy(row, sigma, entry.max_blur)[::3] & (number % 2 == 0)
-        stripe = Stripe(0, number, np.zeros(3), row, normals, planarity, np.zeros((64, 3), np.float32), sigma, solid)
+        stripe = Stripe(0, number, np.eye(4), row, normals, planarity, np.zeros((64, 3), np.float32), sigma, solid)
         point_map.refine_normals(np.unique(point_map.insert(stripe).clip(0)), np.zeros(3))
+    c = point_map.columns
+    smooth_normals(point_map.grid, c.position, c.normal, point_map.alive(), limits.normal_radius)
     scan = LaserScan(0, points, points[:, :2], sigma, sigma)
     every, normals, planarity = np.ones(64, np.bool_), np.zeros((64, 3), np.float32), np.zeros(64, np.float32)
     posed = PosedScan(scan, 1000, np.eye(4), np.zeros((64, 3), np.float32), every, every, normals, planarity)

@@ -51,7 +51,7 @@ def stripe(points: FloatArray, number: int = 0, **changes: object) -> Stripe:
     columns: dict[str, object] = {
         "stamp_ns": number * 2 * FRAME_NS,
         "number": number,
-        "viewpoint": points.mean(axis=0) + np.array([0, 0, CAMERA_HEIGHT]),
+        "T_map_camera": looking_down(*points.mean(axis=0)[:2], points[:, 2].mean() + CAMERA_HEIGHT),
         "points": np.asarray(points, np.float64),
         "normals": np.zeros((count, 3), np.float32),
         "planarity": np.zeros(count, np.float32),

@@ -1,9 +1,10 @@
 from __future__ import annotations
 
+import cv2
 import numpy as np
 from mapping_scenes import calibration
 
-from vli_mapping.colour import colour_points
+from vli_mapping.colour import colour_points, sight
 
 CAMERA = calibration().camera
 
@@ -11,7 +12,7 @@ CAMERA = calibration().camera
 def ramp() -> np.ndarray:
     """Return a BGR image whose blue grows with u, green with v."""
     v, u = np.mgrid[0:480, 0:640]
-    return np.stack([u // 4, v // 4, np.full_like(u, 7)], axis=2).astype(np.uint8)
+    return np.stack([np.clip(u - 300, 0, 255), np.clip(v - 150, 0, 255), np.full_like(u, 7)], axis=2).astype(np.uint8)
 
 
 def at_pixel(u: float, v: float, depth: float = 0.03) -> np.ndarray:
@@ -20,7 +21,7 @@ def at_pixel(u: float, v: float, depth: float = 0.03) -> np.ndarray:
 
 def test_colour_is_rgb_and_bilinear() -> None:
     rgb = colour_points(CAMERA, at_pixel(403.5, 200.0), [(ramp(), np.eye(4))])
-    np.testing.assert_allclose(rgb, [[7, 50, (100 + 101) / 2]], atol=1e-3)
+    np.testing.assert_allclose(rgb, [[7, 50, 103.5]], atol=1e-3)
 
 
 def test_views_are_averaged_and_those_that_do_not_show_a_point_are_left_out() -> None:
@@ -45,6 +46,36 @@ def test_a_grey_image_gives_grey() -> None:
 
 def test_the_pose_of_the_view_counts() -> None:
     T = np.eye(4)
-    T[0, 3] = 4 / 360 * 0.03
+    T[0, 3] = 1 / 360 * 0.03
     moved = colour_points(CAMERA, at_pixel(404, 200), [(ramp(), T)])
-    np.testing.assert_allclose(moved[0, 2], 100, atol=1e-3)
+    np.testing.assert_allclose(moved[0, 2], 103, atol=1e-3)
+
+
+def test_a_saturated_view_counts_only_where_there_is_no_other() -> None:
+    views = [(np.full((480, 640, 3), 255, np.uint8), np.eye(4)), (np.full((480, 640, 3), 90, np.uint8), np.eye(4))]
+    np.testing.assert_allclose(colour_points(CAMERA, at_pixel(300, 200), views), [[90, 90, 90]], atol=0.5)
+    np.testing.assert_allclose(colour_points(CAMERA, at_pixel(300, 200), views[:1]), [[255, 255, 255]], atol=1e-3)
+
+
+def test_a_blurred_print_is_sharpened_and_flat_colour_kept() -> None:
+    sharp = np.full((480, 640), 50, np.uint8)
+    sharp[:, 320:] = 150
+    blurred = cv2.GaussianBlur(sharp, (0, 0), 1.0)
+    points = np.concatenate([at_pixel(u, 200.0) for u in np.arange(310.0, 330.0, 0.5)])
+    truth = np.where(np.arange(310.0, 330.0, 0.5) < 319.5, 50, 150)
+    colours = colour_points(CAMERA, points, [(blurred, np.eye(4))])[:, 0]
+    plain = np.array([blurred[200, int(u)] for u in np.arange(310.0, 330.0, 0.5)], float)
+    assert np.abs(colours - truth).sum() < 0.85 * np.abs(plain - truth).sum()
+    np.testing.assert_allclose(colours[:12], 50, atol=1)
+
+
+def test_spots_are_sighted_only_where_they_face_two_views_and_are_well_exposed() -> None:
+    grey, dark = np.full((480, 640, 3), 100, np.uint8), np.zeros((480, 640, 3), np.uint8)
+    points = np.concatenate([at_pixel(300, 200), at_pixel(310, 200), at_pixel(320, 200)])
+    normals = np.array([[0, 0, -1], [1, 0, 0], [0, 0, 0]], np.float32)
+    twice = sight(CAMERA, points, normals, [(grey, np.eye(4)), (grey, np.eye(4)), (dark, np.eye(4))])
+    np.testing.assert_array_equal(twice.spot, [0, 0])
+    np.testing.assert_allclose(twice.level, 100)
+    np.testing.assert_allclose(twice.points, points[[0, 0]])
+    assert len(sight(CAMERA, points, normals, [(grey, np.eye(4)), (dark, np.eye(4))]).spot) == 0
+    assert len(sight(CAMERA, points, normals, []).spot) == 0

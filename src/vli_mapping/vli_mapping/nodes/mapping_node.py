@@ -112,12 +112,12 @@ class MappingNode(VliNode):
         self._published_points = len(self._mapper.map)
         limit = self.parameters.config(MappingConfig).max_published_points
         stamp_ns = self.get_clock().now().nanoseconds
-        self.send(MAP, cloud_to_message(self._mapper.map.thinned(limit, stamp_ns, self.session)))
+        self.send(MAP, cloud_to_message(self._mapper.cloud(limit, stamp_ns, self.session)))
 
     def _save(self) -> str:
         """Write the map in the worker, where nothing changes it meanwhile, and answer when that is done."""
         path = Path(self.parameters.config(StoreConfig).save_path).absolute()
-        cloud: PointCloud = self.call(lambda: self.mapper.map.cloud())
+        cloud: PointCloud = self.call(lambda: self.mapper.cloud())
         if not len(cloud):
             raise OutputError(f"the map is empty, '{path}' is not written")
         write_ply(path, cloud)
