@@ -3,7 +3,8 @@
     python test/perf/goals.py [--seeds 1] [--data DIR] [--only keyboard-full ...] [--json F]
 
 Recordings are kept in ``--data`` and used again; the six passes take half an hour to make on two cores, the others two to six
-minutes. The recording of another generator in ``../shared/data`` is used where it is there. Starts in motion: `bench_starts.py`; time: `test_speed.py`.
+minutes. The recording of another generator in ``../shared/data`` is used where it is there. Starts in motion:
+`bench_starts.py`; time: `test_speed.py`.
 """
 
 from __future__ import annotations

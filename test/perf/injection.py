@@ -263,7 +263,7 @@ class ImuTruth:
 
 def bias_of(errors: FloatArray, period_s: float) -> FloatArray:
     """Return the slow part (N, 6) of an IMU's errors (N, 6)."""
-    result: FloatArray = uniform_filter1d(errors, max(1, round(_BIAS_WINDOW_S / period_s)), axis=0, mode="nearest")
+    result: FloatArray = uniform_filter1d(errors, max(1, round(_BIAS_WINDOW_S / period_s)), axis=0, mode="reflect")
     return result
 
 

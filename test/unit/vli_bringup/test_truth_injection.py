@@ -125,7 +125,8 @@ def test_without_bias_the_noise_stays_and_an_ideal_imu_has_neither(truth: Truth)
     np.testing.assert_allclose(errors(Injection.IMU), 0.0, atol=1e-12)
     np.testing.assert_allclose(errors(Injection.BIAS).mean(axis=0), 0.0, atol=2e-3)
     assert errors(Injection.BIAS).std() == pytest.approx(0.01, rel=0.05)
-    np.testing.assert_allclose(bias_of(np.tile(bias, (50, 1)), 0.005), np.tile(bias, (50, 1)))
+    ends = bias_of(bias + noise, 0.005)[[0, -1]]
+    np.testing.assert_allclose(ends, np.tile(bias, (2, 1)), atol=3e-3)
     assert ImuTruth.of(samples, true_motion, Injection.START).played(Injection.START) is samples
 
 
