@@ -16,6 +16,7 @@ from scipy.ndimage import uniform_filter1d
 
 from vli_backend.backend import BackEnd
 from vli_backend.config import BackEndConfig
+from vli_backend.dead_reckoning import DeadReckoning
 from vli_backend.depth_prior import DepthPrior
 from vli_backend.estimator import WindowEstimator
 from vli_backend.smoother import KeyframeState, StatePrior
@@ -203,7 +204,7 @@ class TrueStarter(Starter):
         """See :meth:`Starter.add_scan`."""
         self._stripes = [*self._stripes[-4:], scan]
 
-    def add_frame(self, frame: FrontEndOutput, T_map_imu: FloatArray) -> WindowEstimator | None:
+    def add_frame(self, frame: FrontEndOutput, place: DeadReckoning) -> WindowEstimator | None:
         """See :meth:`Starter.add_frame`."""
         tracks = frame.tracks
         if not tracks.keyframe or not self._stripes:
