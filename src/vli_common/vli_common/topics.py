@@ -94,7 +94,7 @@ LASER_POINTS = Topic(
 TRACKS = Topic("tracks", _CLOUD, 10, ("frontend_node",), ("backend_node",), fields=TRACKS_FIELDS)
 PREINTEGRATION = Topic("preintegration", _CLOUD, 10, ("frontend_node",), ("backend_node",), fields=preintegration_fields(0))
 BIAS = Topic("bias", "geometry_msgs/msg/TwistStamped", 1, ("backend_node",), ("frontend_node",), transient_local=True)
-ODOMETRY = Topic("odometry", "nav_msgs/msg/Odometry", 10, ("backend_node",), ("anyone",))
+ODOMETRY = Topic("odometry", "nav_msgs/msg/Odometry", 10, ("backend_node",), ("frontend_node", "anyone"))
 POSE = Topic("pose", "geometry_msgs/msg/PoseStamped", 10, ("backend_node",), ("anyone",))
 PATH = Topic("path", "nav_msgs/msg/Path", 10, ("backend_node",), ("anyone",))
 TF = Topic("/tf", "tf2_msgs/msg/TFMessage", 10, ("backend_node",), ("anyone",))
