@@ -91,7 +91,7 @@ def normal_equations(
     by_pose, by_parameters = by_pose * root[:, None], by_parameters * root[:, None]
     block = by_pose.T @ by_pose
     coupling = by_pose.T @ by_parameters
-    inverse = np.asarray(np.linalg.pinv(block + np.diag(damping * block.diagonal()), hermitian=True), dtype=np.float64)
+    inverse = _inverse(block + np.diag(damping * block.diagonal()))
     pose_gradient = by_pose.T @ error
     return NormalEquations(
         by_parameters.T @ by_parameters - coupling.T @ inverse @ coupling,
@@ -101,6 +101,14 @@ def normal_equations(
         pose_gradient,
         float(error @ error),
     )
+
+
+def _inverse(block: FloatArray) -> FloatArray:
+    try:
+        inverse: FloatArray = np.linalg.inv(block)
+    except np.linalg.LinAlgError:
+        inverse = np.linalg.pinv(block).astype(np.float64)
+    return inverse
 
 
 def solve(

@@ -25,6 +25,9 @@ MODEL_CHOICES: dict[str, tuple[str, ...]] = {
 """``--model`` → lens models to choose from, fewest parameters first."""
 
 
+_IMMATERIAL = 0.02
+
+
 @dataclass(frozen=True, slots=True)
 class Candidate:
     """One lens model in the comparison.
@@ -58,7 +61,7 @@ def select_camera(views: Sequence[View], target: Target, resolution: tuple[int, 
     Each image's corners are held against the camera of all other images, only the board's pose being fitted. All models are
     judged by the same corners of the same images: those that any of them kept, so that none gains by throwing out the corners
     that speak against it. Errors are compared image by image, as logarithms. The model with the fewest parameters wins that is
-    within one standard error of the best (Breiman's rule). A model whose distortion folds the image over itself is out.
+    within one standard error of the best (Breiman's rule), or within 2 %. A model whose distortion folds the image over itself is out.
 
     Args:
         views: corners by image.
@@ -112,7 +115,7 @@ def _simplest_of_the_best(errors: Mapping[str, FloatArray]) -> str:
     logs = {model: np.log(error) for model, error in errors.items()}
     best = min(logs, key=lambda model: float(logs[model].mean()))
     difference = {model: log - logs[best] for model, log in logs.items()}
-    tied = [d for d in logs if difference[d].mean() <= difference[d].std(ddof=1) / np.sqrt(len(difference[d]))]
+    tied = [d for d in logs if difference[d].mean() <= max(difference[d].std(ddof=1) / np.sqrt(len(difference[d])), _IMMATERIAL)]
     return min(tied, key=lambda model: (len(LENSES[model].parameters), float(logs[model].mean())))
 
 

@@ -18,6 +18,8 @@ _ROUGH_ITERATIONS = 6
 _REWEIGHTINGS = 12
 _SETTLED = 1e-3
 _PROMISING = 3
+_VIEWS = 12
+"""Views for the search; the rest follows once a camera is there."""
 
 
 def starting_state(lens: Lens, observations: Sequence[Observation], resolution: tuple[int, int]) -> BundleState | None:
@@ -27,10 +29,30 @@ def starting_state(lens: Lens, observations: Sequence[Observation], resolution: 
         observations: all corners of each view.
         resolution: width and height, pixels.
     """
+    some = [observations[i] for i in np.unique(np.linspace(0, len(observations) - 1, _VIEWS).round().astype(int))]
+    state = _search(lens, some, resolution)
+    if state is None or len(some) == len(observations):
+        return state
+    everywhere = _with_poses(lens, state.parameters, observations, resolution)
+    return _search(lens, observations, resolution) if everywhere is None else _settle(lens, everywhere, observations)
+
+
+def _search(lens: Lens, observations: Sequence[Observation], resolution: tuple[int, int]) -> BundleState | None:
+    """Return the estimate with the smallest median residual among those that the focal lengths lead to."""
     rough = [state for state in (_rough(lens, observations, resolution, f) for f in _FOCALS_OF_SIDE) if state is not None]
     rough.sort(key=lambda state: _spread(lens, state, observations))
     settled = [_settle(lens, state, observations) for state in rough[:_PROMISING]]
     return min(settled, key=lambda state: _spread(lens, state, observations), default=None)
+
+
+def _with_poses(
+    lens: Lens, parameters: FloatArray, observations: Sequence[Observation], resolution: tuple[int, int]
+) -> BundleState | None:
+    """Return the camera with a pose for every view; None where one has none."""
+    camera = lens.camera(parameters, resolution)
+    poses = [starting_pose(camera, seen.points, seen.pixels) for seen in observations]
+    found = [pose for pose in poses if pose is not None]
+    return BundleState(parameters, np.array(found)) if len(found) == len(poses) else None
 
 
 def _rough(
@@ -41,12 +63,9 @@ def _rough(
     focal = focal_of_side * max(resolution)
     parameters = np.zeros(len(lens.parameters))
     parameters[:4] = focal, focal, (width - 1) / 2, (height - 1) / 2
-    camera = lens.camera(parameters, resolution)
-    poses = [starting_pose(camera, seen.points, seen.pixels) for seen in observations]
-    found = [pose for pose in poses if pose is not None]
-    if len(found) < len(poses):
+    state = _with_poses(lens, parameters, observations, resolution)
+    if state is None:
         return None
-    state = BundleState(parameters, np.array(found))
     held = [i for i, name in enumerate(lens.parameters) if name not in ("fx", "fy", "k1")]
     return solve(lens, state, _weighted(lens, state, observations), held, _ROUGH_ITERATIONS)
 

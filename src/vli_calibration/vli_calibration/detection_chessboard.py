@@ -67,6 +67,8 @@ def _find(target: Chessboard, grey: ByteArray) -> FloatArray | str:
     size = seen_size(grey)
     if size is None:
         return _why_nothing(grey)
+    if max(size) > max(target.columns, target.rows) or min(size) > min(target.columns, target.rows):
+        return _why_not_this(target, size)
     corners = _first_found(target, _costly_attempts(grey, first))
     return _why_not_this(target, size) if corners is None else corners
 
@@ -92,7 +94,6 @@ def _costly_attempts(grey: ByteArray, first: float) -> Iterator[tuple[ByteArray,
         yield equalised(scaled(grey, scale)), 0, scale
         yield flattened(scaled(grey, scale)), 0, scale
     yield equalised(scaled(grey, first)), cv2.CALIB_CB_EXHAUSTIVE, first
-    yield flattened(scaled(grey, first)), cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_NORMALIZE_IMAGE, first
 
 
 def _oriented(target: Chessboard, grey: ByteArray, corners: FloatArray) -> FloatArray:
