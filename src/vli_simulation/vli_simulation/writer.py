@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 from rosbags.interfaces import Connection
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from vli_common.arrays import AnyArray, FloatArray
@@ -35,6 +35,9 @@ class BagWriter:
         self._with_camera = with_camera
         self._store = get_typestore(Stores.ROS2_JAZZY)
         self._writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
+        if not with_camera:
+            # Images are compressed already; IMU messages are covariances and other repetition for the most part.
+            self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
         self._rig, self._compressed, self._exposure_topic = rig, compressed, exposure_topic
         variance = np.array([imu.gyroscope_noise_density, imu.accelerometer_noise_density]) ** 2 * imu.rate_hz
         self._gyro_covariance, self._accel_covariance = (np.diag([value] * 3).ravel() for value in variance)

@@ -53,7 +53,7 @@ def _poses(directory: Path) -> dict[str, FloatArray]:
 def stills(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("board") / "set"
     noise_free = [part for key, value in QUIET.items() for part in ("--set", f"{key}={value}")]
-    arguments = ("--parts", "camera", "laser", "--images", "5", "--target", BOARD, "--seed", "4")
+    arguments = ("--parts", "camera", "laser", "--images", "4", "--target", BOARD, "--seed", "4")
     assert _run("--out", str(out), *arguments, *noise_free, "--set", "board.shake=0.0") == 0
     return out
 
@@ -71,7 +71,7 @@ def test_corners_stand_where_they_project_to(stills: Path) -> None:
         )
         errors.append(found[:, 0] - expected)
     together = np.concatenate(errors)
-    assert len(together) == 10 * 35
+    assert len(together) == 8 * 35
     # The detector itself scatters by some 0.04 px on ideal images; a bias of the renderer would survive the mean.
     assert np.abs(together.mean(axis=0)).max() < 0.01
     assert np.abs(np.median(together, axis=0)).max() < 0.015
@@ -107,7 +107,7 @@ def test_the_stripe_lies_where_plane_and_board_meet(stills: Path) -> None:
 
 def test_images_cover_tilts_and_distances(stills: Path) -> None:
     poses = _poses(stills)
-    assert sorted(path.name for path in (stills / "camera").iterdir()) == [f"{index:03d}.png" for index in range(5)]
+    assert sorted(path.name for path in (stills / "camera").iterdir()) == [f"{index:03d}.png" for index in range(4)]
     assert sorted(path.name for path in (stills / "laser").iterdir())[:3] == ["000_long.png", "000_short.png", "001_long.png"]
     middle = np.array([[0.012, 0.008, 0.0]])
     depths = [transform(T, middle)[0, 2] for name, T in poses.items() if name.endswith("_short.png")]

@@ -17,6 +17,8 @@ from vli_simulation.rig import Rig, make_rig
 from vli_simulation.sensor import Sensor
 
 _PEAK_GREY = 420.0
+_LUMINANCE = np.array([0.114, 0.587, 0.299])
+"""Of blue, green and red, as a colour becomes grey."""
 _SHORTEST_S, _LONGEST_SHORT_S = 2e-5, 8e-3
 
 
@@ -54,6 +56,8 @@ class BoardSimulation:
             longest_s: of the long exposure.
         """
         white, peak = self.renderer.brightness(view)
+        if self.config.sensor.encoding == "mono":
+            peak *= float(self.rig.laser.response @ _LUMINANCE)
         return Exposures(
             float(np.clip(NOMINAL_LONG_S * white_grey / max(white, 1e-6), _SHORTEST_S, longest_s)),
             float(np.clip(NOMINAL_SHORT_S * _PEAK_GREY / max(peak, 1e-6), _SHORTEST_S, _LONGEST_SHORT_S)),
