@@ -53,8 +53,12 @@ class BoardSurface:
         step = half_px * np.eye(2)[axis]
         at, below, above = (self._on_board(pixels + shift) for shift in (0.0, -step, step))
         colour = self._black(at)
-        clear: BoolArray = self._on_sheet(at) & (self._black(below) == colour) & (self._black(above) == colour)
+        clear: BoolArray = self._inside(at, SHEET_MARGIN) & (self._black(below) == colour) & (self._black(above) == colour)
         return clear
+
+    def on_print(self, pixels: FloatArray) -> BoolArray:
+        """Return which points (N,) lie within the print, and so on the board for certain."""
+        return self._inside(self._on_board(pixels), 0.0)
 
     def _on_board(self, pixels: FloatArray) -> FloatArray:
         """Return board coordinates x, y (N, 2) of raw pixels; NaN where the ray does not meet the board."""
@@ -62,9 +66,10 @@ class BoardSurface:
         points[~(points[:, 2] > 0)] = np.nan
         return transform(inverse(self.T_cam_board), points)[:, :2]
 
-    def _on_sheet(self, xy: FloatArray) -> BoolArray:
+    def _inside(self, xy: FloatArray, share: float) -> BoolArray:
+        """Return which board coordinates (N, 2) lie within the print, grown by a share of its shorter side."""
         x0, y0, x1, y1 = self.target.extent
-        margin = SHEET_MARGIN * min(x1 - x0, y1 - y0)
+        margin = share * min(x1 - x0, y1 - y0)
         lowest, highest = np.array([x0, y0]) - margin, np.array([x1, y1]) + margin
         return np.asarray(((xy >= lowest) & (xy <= highest)).all(axis=1))
 

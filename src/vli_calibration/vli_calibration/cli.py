@@ -9,6 +9,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "camera": ("camera", "intrinsics and lens distortion from images of a flat target"),
     "imu": ("imu", "noise densities and random walks of an IMU from hours at rest"),
     "imu-camera": ("imu_camera", "rotation, translation and time offset between camera and IMU from a moving board"),
+    "laser": ("laser", "the laser plane from images of a flat target with the stripe on it"),
     "target": ("target", "a target as PDF at true scale, with a ruler on it"),
 }
 """Name → module in :mod:`vli_calibration.commands` with ``add_arguments(parser)`` and ``run(args) -> int``, and its help."""

@@ -189,8 +189,8 @@ def _spread(errors: FloatArray) -> FloatArray:
 def _disagreement(names: Sequence[str], agree: BoolArray, errors: FloatArray) -> str:
     if 2 * agree.sum() <= len(agree):
         return (
-            f"arm poses fit the boards in only '{int(agree.sum())}' of {len(agree)} images; expected the pose of each image's own "
-            "moment, T_base_tool: check their order and convention, or leave out --poses"
+            f"arm poses fit the boards in only '{int(agree.sum())}' of {len(agree)} images; expected the pose of each image's "
+            "own moment, T_base_tool: check their order and convention, or leave out --poses"
         )
     wrong = [
         f"'{name}' ({np.degrees(np.linalg.norm(error[:3])):.0f}°, {1e3 * np.linalg.norm(error[3:]):.0f} mm off)"

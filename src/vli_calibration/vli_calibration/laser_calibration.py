@@ -174,8 +174,11 @@ def calibrate_laser(
 
 
 def _hand_eye(scenes: Sequence[LaserScene], target: Target) -> HandEye | None:
-    posed = [(scene.name, scene.image.T_base_tool, scene.board.T_cam_board)
-             for scene in scenes if scene.board is not None and scene.image.T_base_tool is not None]  # fmt: skip
+    posed = [
+        (scene.name, scene.image.T_base_tool, scene.board.T_cam_board)
+        for scene in scenes
+        if scene.board is not None and scene.image.T_base_tool is not None
+    ]
     if not posed:
         return None
     names, tool, boards = zip(*posed, strict=True)
@@ -193,7 +196,9 @@ def _agreeing_views(
     correlation = float(np.median([scene.stripe.correlation for scene in scenes if scene.stripe]))
     views = [view for scene in scenes if (view := _view(scene, target, correlation, arm)) is not None]
     striped = [view for view in views if len(view.stripe) and view.prior is None]
-    points = _image_points(striped, camera, along_columns)
+    points = _image_points(
+        striped, camera, along_columns, {scene.name for scene in scenes if scene.stripe and scene.stripe.on_print}
+    )
     _check_spread(points)
     agreeing, out = agreeing_images(points, LEAST_IMAGES)
     reasons = [
@@ -214,8 +219,8 @@ def _view(scene: LaserScene, target: Target, correlation: float, arm: HandEye | 
     """Return what one image contributes; None where it has nothing to say."""
     points, pixels = corners(scene, target)
     empty = np.empty((0, 2))
-    stripe, sigma = (scene.stripe.pixels[scene.stripe.kept], scene.stripe.sigma_px[scene.stripe.kept]) if scene.stripe else (
-        empty, np.empty(0))  # fmt: skip
+    kept = scene.stripe.kept if scene.stripe else np.zeros(0, np.bool_)
+    stripe, sigma = (scene.stripe.pixels[kept], scene.stripe.sigma_px[kept]) if scene.stripe else (empty, np.empty(0))
     if scene.board is not None:
         return LaserView(scene.name, points, pixels, stripe, sigma, correlation, scene.board.T_cam_board)
     if arm is None or scene.stripe is None or scene.image.T_base_tool is None:
@@ -225,18 +230,15 @@ def _view(scene: LaserScene, target: Target, correlation: float, arm: HandEye | 
     )
 
 
-def _image_points(views: Sequence[LaserView], camera: CameraModel, along_columns: bool) -> list[ImagePoints]:
+def _image_points(views: Sequence[LaserView], camera: CameraModel, along_columns: bool, sure: set[str]) -> list[ImagePoints]:
     met = [stripe_points(camera, view.T_cam_board, view.stripe) for view in views]
     plane = fit_plane_robust(np.concatenate(met))
-    return [
-        ImagePoints(
-            view.name,
-            points,
-            stripe_sigmas(camera, np.broadcast_to(view.T_cam_board, (len(points), 4, 4)), points, view.sigma_px, plane, int(along_columns)),
-            view.correlation,
-        )
-        for view, points in zip(views, met, strict=True)
-    ]  # fmt: skip
+    result = []
+    for view, points in zip(views, met, strict=True):
+        poses = np.broadcast_to(view.T_cam_board, (len(points), 4, 4))
+        sigmas = stripe_sigmas(camera, poses, points, view.sigma_px, plane, int(along_columns))
+        result.append(ImagePoints(view.name, points, sigmas, view.correlation, view.name in sure))
+    return result
 
 
 def _check_spread(points: Sequence[ImagePoints]) -> None:
@@ -244,8 +246,8 @@ def _check_spread(points: Sequence[ImagePoints]) -> None:
     across = float(spread(points)[1])
     if across < _LEAST_SPREAD * depth:
         raise InputError(
-            f"the stripes of all images lie on nearly one line (spread '{1e3 * across:.2f}' mm across it at {1e3 * depth:.0f} mm), "
-            "which leaves the plane free to turn about it; take views at several distances and with the board tilted both ways"
+            f"the stripes of all images lie on nearly one line (spread '{1e3 * across:.2f}' mm across it at {1e3 * depth:.0f} "
+            "mm), which leaves the plane free to turn about it; take views at several distances and with the board tilted both ways"
         )
 
 

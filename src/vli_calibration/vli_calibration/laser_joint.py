@@ -192,7 +192,8 @@ class JointProblem:
             corner_sigma_px=sigma,
             stripe_scale=scale,
             corner_kept=np.all(np.abs(corners) <= OUTLIER_SIGMAS * sigma, axis=1),
-            stripe_kept=(stripe <= OUTLIER_SIGMAS * scale) & (points[:, 2] > 0),
+            # Before the first solve, what an arm predicts is off by more than the stripe's own noise.
+            stripe_kept=((stripe <= OUTLIER_SIGMAS * scale) | (~self._telling & (state.iterations == 0))) & (points[:, 2] > 0),
         )
 
     def _stripe_points(self, state: JointSolution) -> FloatArray:
@@ -286,8 +287,7 @@ def solve_reduced(hessian: FloatArray, right: FloatArray) -> FloatArray:
         scaled = np.linalg.solve(hessian * np.outer(scale, scale), (right.T * scale).T)
     except np.linalg.LinAlgError:
         raise InputError(f"the views do not determine camera and laser plane; {MORE_VIEWS}") from None
-    result: FloatArray = (scaled.T * scale).T
-    return result
+    return np.asarray((scaled.T * scale).T, np.float64)
 
 
 def _damped(hessian: FloatArray, damping: float) -> FloatArray:

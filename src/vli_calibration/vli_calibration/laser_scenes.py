@@ -90,8 +90,8 @@ def require_boards(scenes: Sequence[LaserScene], target: Target) -> None:
     if not any(scene.board for scene in scenes):
         reason = Counter(scene.reason for scene in scenes).most_common(1)[0][0]
         raise InputError(
-            f"no board '{target.spec}' found in {len(scenes)} of {len(scenes)} images ({reason}); check --target against the board, and "
-            " that the whole board shows, sharp and not overexposed"
+            f"no board '{target.spec}' found in {len(scenes)} of {len(scenes)} images ({reason}); check --target against the "
+            "board, and  that the whole board shows, sharp and not overexposed"
         )
 
 

@@ -13,6 +13,8 @@ from vli_common.arrays import FloatArray
 DISAGREEING = 3.0
 """An image this many times as far from the plane of all others as images usually are does not belong to them."""
 
+_BESIDE = 6.0
+"""Looser for a first look, where few images may fix the plane."""
 _LEAST_SHARE = 2 / 3
 _ITERATIONS = 30
 _TUNING = 4.685
@@ -54,12 +56,14 @@ class ImagePoints:
         points: (M, 3) camera frame.
         sigmas: (M,) of their distance from a plane, metres.
         correlation: number of neighbours that err together.
+        sure: the stripe crosses the print, so it lies on the board.
     """
 
     name: str
     points: FloatArray
     sigmas: FloatArray
     correlation: float = 1.0
+    sure: bool = True
 
     @property
     def weights(self) -> FloatArray:
@@ -101,7 +105,7 @@ def disagreements(images: Sequence[ImagePoints]) -> list[Disagreement]:
     for index, image in enumerate(images):
         plane = fit_images([*images[:index], *images[index + 1 :]])
         distance = plane.distance(image.points)
-        size = float(np.sqrt(np.mean((distance / image.sigmas) ** 2)))
+        size = _size(plane, image)
         tilt = float(np.arccos(np.clip(plane.normal @ whole.normal, -1.0, 1.0)))
         shift = abs(float((plane.distance(centre[None]) - whole.distance(centre[None]))[0]))
         raw.append((image.name, size, float(np.sqrt(np.mean(distance**2))), tilt, shift))
@@ -115,7 +119,7 @@ def agreeing_images(images: Sequence[ImagePoints], least: int) -> tuple[list[Ima
     An image is left out where it is :data:`DISAGREEING` times as far from the plane of all others as images usually are. At
     least ``least`` images, and two in three, stay.
     """
-    kept, out = list(images), []
+    kept, out = _beside_the_board(images, least)
     while len(kept) > max(least, int(np.ceil(len(images) * _LEAST_SHARE))):
         worst = max(disagreements(kept), key=lambda found: found.size)
         if worst.size <= DISAGREEING:
@@ -123,6 +127,33 @@ def agreeing_images(images: Sequence[ImagePoints], least: int) -> tuple[list[Ima
         out.append(worst)
         kept = [image for image in kept if image.name != worst.name]
     return kept, out
+
+
+def _beside_the_board(images: Sequence[ImagePoints], least: int) -> tuple[list[ImagePoints], list[Disagreement]]:
+    """Return the images without those whose stripe lies beside the print and off the plane of those that cross it.
+
+    A stripe beside the print may lie on a table under the board; however many such images there are, they have no vote.
+    """
+    sure = [image for image in images if image.sure]
+    if len(sure) < least:
+        return list(images), []
+    found = disagreements(sure)
+    plane = fit_images([image for image, item in zip(sure, found, strict=True) if item.size <= DISAGREEING])
+    common = float(np.median([_size(plane, image) for image in sure]))
+    out = [
+        Disagreement(
+            image.name, _size(plane, image) / common, float(np.sqrt(np.mean(plane.distance(image.points) ** 2))), 0.0, 0.0
+        )
+        for image in images
+        if not image.sure and _size(plane, image) > _BESIDE * common
+    ]
+    names = {item.name for item in out}
+    return [image for image in images if image.name not in names], out
+
+
+def _size(plane: LaserPlane, image: ImagePoints) -> float:
+    """Return the RMS distance of an image's points from a plane, in their sigmas."""
+    return float(np.sqrt(np.mean((plane.distance(image.points) / image.sigmas) ** 2)))
 
 
 def spread(images: Sequence[ImagePoints]) -> FloatArray:

@@ -40,20 +40,24 @@ def bearings(camera: CameraModel, pixels: FloatArray) -> FloatArray:
     return result
 
 
-def fit_stripe_line(camera: CameraModel, pixels: FloatArray, tolerance_px: float = 2.0) -> StripeLine | None:
+def fit_stripe_line(
+    camera: CameraModel, pixels: FloatArray, sure: BoolArray | None = None, tolerance_px: float = 2.0
+) -> StripeLine | None:
     """Return the great circle that most points lie on (RANSAC, then trimmed least squares), None where there is none.
 
     Args:
         camera: its lens is taken out.
         pixels: (N, 2) raw.
+        sure: (N,) points that the search starts from; others only join their line. All where None.
         tolerance_px: of the search; the refinement finds the scatter of the points itself.
     """
     directions = bearings(camera, pixels)
-    valid: BoolArray = np.isfinite(directions).all(axis=1)
-    if valid.sum() < 3:
+    valid = np.all(np.isfinite(directions), axis=1)
+    start = valid if sure is None else valid & sure
+    if start.sum() < 3:
         return None
     directions = np.where(valid[:, None], directions, 0.0)
-    inliers = valid & _largest_consensus(directions, np.flatnonzero(valid), tolerance_px / camera.focal_px)
+    inliers = start & _largest_consensus(directions, np.flatnonzero(start), tolerance_px / camera.focal_px)
     normal, residuals, scatter = np.zeros(3), np.full(len(pixels), np.inf), 0.0
     for _ in range(_REFINEMENTS):
         if inliers.sum() < 3:
@@ -77,6 +81,7 @@ def _largest_consensus(directions: FloatArray, candidates: IntArray, tolerance: 
     normals = normals[apart] / length[apart][:, None]
     if not len(normals):
         return np.zeros(len(directions), np.bool_)
-    near = np.abs(directions @ normals.T) <= tolerance
-    best: BoolArray = near[:, int(near.sum(axis=0).argmax())]
-    return best
+    near = np.abs(directions[candidates] @ normals.T) <= tolerance
+    consensus = np.zeros(len(directions), np.bool_)
+    consensus[candidates[near[:, int(near.sum(axis=0).argmax())]]] = True
+    return consensus

@@ -8,7 +8,7 @@ line is kept: on a flat surface the stripe is straight once the lens is taken ou
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import cv2
@@ -34,6 +34,7 @@ _MOST_SMOOTHING_PX = 5.0
 _MAX_LEAN = 0.1
 """Looser than in the driver: a square's edge under the line makes it lean, and the straight line tells what is wrong with it."""
 _MIN_LENGTH = 0.12
+_SURE_POINTS = 20
 _MIN_FILL = 0.4
 _MAX_SCATTER = 0.1
 _LEAST_SCATTER_PX = 1.5
@@ -49,16 +50,18 @@ class BoardStripe:
     """The stripe of one image.
 
     Args:
-        pixels: (N, 2) raw u, v of all points detected on the surface.
+        pixels: (N, 2) raw u, v of all points detected on the surface, up to a line width off the line: further off is another.
         sigma_px: (N,) across the stripe, one sigma of noise and speckle, and of what lens model, paper and print leave.
         correlation: number of neighbours that err together: integrated autocorrelation of the residuals along the line.
         line: the straight line through them, and which points lie on it.
+        on_print: it crosses the print of the board; False: it lies beside the print, on what is taken to be the same sheet.
     """
 
     pixels: FloatArray
     sigma_px: FloatArray
     correlation: float
     line: StripeLine
+    on_print: bool = False
 
     def __len__(self) -> int:
         return len(self.pixels)
@@ -120,11 +123,17 @@ class StripeFinder:
         points = self._detect(scene.pixels, width_px)
         inside = self._inside(points.pixels, scene.surface, 0.5 * width_px)
         pixels = points.pixels[inside]
-        line = fit_stripe_line(self.camera, pixels)
+        # A table beside the sheet has a stripe too, perhaps the longer one; that on the print is on the board for certain.
+        on_print = scene.surface.on_print(pixels) if scene.surface is not None else np.zeros(len(pixels), np.bool_)
+        sure = on_print if on_print.sum() >= _SURE_POINTS else None
+        line = fit_stripe_line(self.camera, pixels, sure)
         if line is None or not self._is_stripe(pixels, line, width_px):
             return None
         sigma_px = np.hypot(points.sigma_px[inside], _LEAST_SIGMA_PX)
-        return BoardStripe(pixels, sigma_px, correlation_length(line.residuals_px[line.inliers]), line)
+        correlation = correlation_length(line.residuals_px[line.inliers])
+        here = np.abs(line.residuals_px) <= width_px
+        line = replace(line, residuals_px=line.residuals_px[here], inliers=line.inliers[here])
+        return BoardStripe(pixels[here], sigma_px[here], correlation, line, sure is not None)
 
     def _detect(self, pixels: ByteArray, width_px: float) -> StripePoints:
         config = StripeConfig(
