@@ -23,7 +23,6 @@ setup(
         "gtsam>=4.2",
         "Jinja2>=3.1",
         "matplotlib>=3.6",
-        "numba>=0.59",
         "numpy>=1.26",
         "opencv-python-headless>=4.6,<5",
         "PyYAML>=6.0",
