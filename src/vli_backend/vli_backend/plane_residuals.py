@@ -1,0 +1,65 @@
+"""Laser depths against what vision alone says of the same landmarks: the evidence of a laser plane that has moved."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from vli_backend.condense import LandmarkArrays, refine
+from vli_backend.landmarks import LandmarkTable
+from vli_common.arrays import BoolArray, FloatArray
+
+_MIN_OBSERVATIONS = 4
+
+
+@dataclass(frozen=True)
+class PlaneResiduals:
+    """Laser depths of N landmarks, compared.
+
+    Args:
+        rays: (N, 2) where the laser measured them.
+        inverse_depth: (N,) 1/m, by the laser.
+        error: (N,) 1/m, laser less vision.
+        sigma: (N,) 1/m, of the error.
+    """
+
+    rays: FloatArray
+    inverse_depth: FloatArray
+    error: FloatArray
+    sigma: FloatArray
+
+
+def plane_residuals(
+    table: LandmarkTable, rows: BoolArray, T_map_camera: FloatArray, cauchy: float, limits: tuple[float, float]
+) -> PlaneResiduals:
+    """Return the laser depths of landmarks less those that their other observations give, poses fixed.
+
+    Args:
+        table: of the window; not changed.
+        rows: (L,) the landmarks to compare; those without a laser depth or with few observations are left out.
+        T_map_camera: (K, 4, 4) of the window.
+        cauchy: robust loss, sigmas.
+        limits: of inverse depths, 1/m.
+    """
+    chosen = np.flatnonzero(rows & (table.observations >= _MIN_OBSERVATIONS) & (table.arrays.depth_sigma > 0).any(axis=1))
+    arrays = table.arrays
+    slot = np.argmax(arrays.depth_sigma[chosen] > 0, axis=1)
+    measured, sigma = arrays.depth[chosen, slot], arrays.depth_sigma[chosen, slot]
+    blind = LandmarkArrays(
+        arrays.anchor[chosen],
+        arrays.anchor_ray[chosen],
+        arrays.rho[chosen].copy(),
+        arrays.prior[chosen],
+        arrays.rays[chosen],
+        arrays.sigma[chosen],
+        arrays.depth[chosen],
+        np.zeros_like(arrays.depth_sigma[chosen]),
+    )
+    information = refine(blind, T_map_camera, np.ones(len(chosen), np.bool_), cauchy, limits)
+    rays = np.column_stack([blind.anchor_ray, np.ones(len(chosen))]) / blind.rho[:, None]
+    anchor, primary = T_map_camera[blind.anchor], T_map_camera[slot]
+    in_map = np.einsum("nij,nj->ni", anchor[:, :3, :3], rays) + anchor[:, :3, 3]
+    seen = np.einsum("nji,nj->ni", primary[:, :3, :3], in_map - primary[:, :3, 3])
+    error = measured - 1.0 / seen[:, 2]
+    return PlaneResiduals(seen[:, :2] / seen[:, 2:], measured, error, np.hypot(sigma, information**-0.5))
