@@ -105,10 +105,9 @@ def normal_equations(
 
 def _inverse(block: FloatArray) -> FloatArray:
     try:
-        inverse: FloatArray = np.linalg.inv(block)
+        return np.asarray(np.linalg.inv(block), dtype=np.float64)
     except np.linalg.LinAlgError:
-        inverse = np.linalg.pinv(block).astype(np.float64)
-    return inverse
+        return np.asarray(np.linalg.pinv(block), dtype=np.float64)
 
 
 def solve(

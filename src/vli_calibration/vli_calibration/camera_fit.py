@@ -186,6 +186,7 @@ def fit_camera(views: Sequence[View], target: Target, resolution: tuple[int, int
     everything = [np.ones(len(view.detection), dtype=bool) for view in usable]
     problem = _Problem(lens, usable, observations, state, everything, np.ones(len(usable)))
     _refine(problem)
+    _check_tilts(problem)
     for _ in range(len(usable)):
         left_out = leave_one_out(lens, problem.state, problem.weighted())
         worst = _worst_view(problem, left_out)

@@ -61,7 +61,8 @@ def select_camera(views: Sequence[View], target: Target, resolution: tuple[int, 
     Each image's corners are held against the camera of all other images, only the board's pose being fitted. All models are
     judged by the same corners of the same images: those that any of them kept, so that none gains by throwing out the corners
     that speak against it. Errors are compared image by image, as logarithms. The model with the fewest parameters wins that is
-    within one standard error of the best (Breiman's rule), or within 2 %. A model whose distortion folds the image over itself is out.
+    within one standard error of the best (Breiman's rule), or within 2 %. A model whose distortion folds the
+    image over itself is out.
 
     Args:
         views: corners by image.

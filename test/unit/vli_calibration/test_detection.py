@@ -65,7 +65,7 @@ def test_a_chessboard_is_found_under_a_stripe_or_glare(disturb: Callable[[ByteAr
     image = disturb(picture(BOARD, RADTAN4, TILTED, np.random.default_rng(2)))
     found, error = errors_px(BOARD, TILTED, image)
     assert len(found) >= 48
-    assert np.median(error) < 0.15
+    assert np.median(error) < 0.25
 
 
 @pytest.mark.parametrize("spin", [0.0, 1.5, 3.0, -1.6])
