@@ -14,6 +14,7 @@ it was built with: where it holds the window, the covariance of the place it was
 
 from __future__ import annotations
 
+import bisect
 import math
 from dataclasses import dataclass
 
@@ -64,7 +65,7 @@ class PoseCovariance:
         self._T_map_imu = np.eye(4)
         self._keyframe = np.zeros((6, 6))
         self._map = np.zeros((6, 6))
-        self._places: list[_Place] = []
+        self._places = _Places()
 
     def set_keyframe(self, stamp_ns: int, T_map_imu: FloatArray, covariance: FloatArray, on_map: bool = False) -> None:
         """Take the newest keyframe.
@@ -75,20 +76,11 @@ class PoseCovariance:
             covariance: (6, 6), marginal, [ω, v] in imu_link.
             on_map: True where the map holds the window.
         """
-        place = self._seen_from(stamp_ns, T_map_imu) if on_map else None
+        place = self._places.seen_before(stamp_ns - _INDEPENDENT_NS, T_map_imu) if on_map else None
         self._map = place.covariance_of(T_map_imu) if place else _carried(self._map, self._T_map_imu, T_map_imu)
         self._T_map_imu, self._keyframe = T_map_imu, covariance + self._map
-        if place is None and self._is_new_ground(T_map_imu):
-            self._places.append(_Place(stamp_ns, T_map_imu, self._keyframe))
-
-    def _seen_from(self, stamp_ns: int, T_map_imu: FloatArray) -> _Place | None:
-        """Return the nearest place whose stripes may be in the map."""
-        places = [place for place in self._places if stamp_ns - place.stamp_ns >= _INDEPENDENT_NS]
-        return min(places, key=lambda place: place.distance(T_map_imu), default=None)
-
-    def _is_new_ground(self, T_map_imu: FloatArray) -> bool:
-        """Return False near the last place, so that nothing grows at rest."""
-        return not self._places or self._places[-1].distance(T_map_imu) > _PLACE_M
+        if place is None:
+            self._places.add(stamp_ns, _Place(T_map_imu, self._keyframe))
 
     def of_keyframe(self) -> FloatArray:
         """Return the covariance (6, 6) of the newest keyframe, in the order of ROS."""
@@ -110,16 +102,40 @@ class PoseCovariance:
 class _Place:
     """A keyframe on new ground: the map around it was built from there."""
 
-    stamp_ns: int
     T_map_imu: FloatArray
     covariance: FloatArray
-
-    def distance(self, T_map_imu: FloatArray) -> float:
-        return math.dist(self.T_map_imu[:3, 3], T_map_imu[:3, 3])
 
     def covariance_of(self, T_map_imu: FloatArray) -> FloatArray:
         """Return the covariance (6, 6) of a pose that is rigidly tied to this one."""
         return _carried(self.covariance, self.T_map_imu, T_map_imu)
+
+
+class _Places:
+    """All places, in the order of their stamps."""
+
+    def __init__(self) -> None:
+        self._places: list[_Place] = []
+        self._stamps_ns: list[int] = []
+        self._positions = np.empty((64, 3))
+
+    def add(self, stamp_ns: int, place: _Place) -> None:
+        """Take a place, unless it is near the last one: nothing grows at rest."""
+        count, position = len(self._places), place.T_map_imu[:3, 3]
+        if count and math.dist(self._positions[count - 1], position) < _PLACE_M:
+            return
+        if count == len(self._positions):
+            self._positions = np.concatenate([self._positions, np.empty_like(self._positions)])
+        self._positions[count] = position
+        self._stamps_ns.append(stamp_ns)
+        self._places.append(place)
+
+    def seen_before(self, stamp_ns: int, T_map_imu: FloatArray) -> _Place | None:
+        """Return the nearest place up to a stamp: its stripes may be in the map."""
+        count = bisect.bisect_right(self._stamps_ns, stamp_ns)
+        if not count:
+            return None
+        squared = ((self._positions[:count] - T_map_imu[:3, 3]) ** 2).sum(axis=1)
+        return self._places[int(squared.argmin())]
 
 
 def _carried(covariance: FloatArray, T_map_before: FloatArray, T_map_after: FloatArray) -> FloatArray:
