@@ -11,11 +11,15 @@ from vli_calibration.types import Detection
 from vli_common.arrays import BoolArray, FloatArray, IntArray
 from vli_common.camera import CameraModel
 from vli_common.geometry import skew
+from vli_common.types import NANOSECONDS
 
 _RAY_STEP = 1e-6
 _LEAST_SIGMA_PX = 0.03
 """No detector is better; keeps perfect synthetic corners from weighing infinitely."""
 _OUTLIER_SIGMAS = 4.0
+_NEIGHBOURS = 3
+_STEADY_RAD, _STEADY_RATE = 0.5, 4.0
+"""Radians, and radians a second, that a board may turn from frame to frame."""
 
 
 @dataclass(frozen=True)
@@ -74,12 +78,30 @@ def track_board(
         stamps.append(stamp_ns)
         poses.append(T)
         kept.append(detection)
+    steady = _steady(np.array(stamps, dtype=np.int64), np.array(poses).reshape(-1, 4, 4))
+    stamps = [stamp_ns for stamp_ns, keep in zip(stamps, steady, strict=True) if keep]
+    poses = [T for T, keep in zip(poses, steady, strict=True) if keep]
+    kept = [detection for detection, keep in zip(kept, steady, strict=True) if keep]
     T_cam_board = np.array(poses).reshape(-1, 4, 4)
     kept, sigma_px = _without_outliers(kept, T_cam_board, camera, points)
     roots = np.array([_root(camera, points[c.ids], T, sigma_px) for c, T in zip(kept, T_cam_board, strict=True)]).reshape(
         -1, 6, 6
     )
     return BoardTrack(np.array(stamps, dtype=np.int64), T_cam_board, roots, tuple(kept), sigma_px)
+
+
+def _steady(stamps_ns: IntArray, T_cam_board: FloatArray) -> BoolArray:
+    """Return which frames (F,) show a board turned much as in most of their neighbours: corners numbered wrongly do not."""
+    count = len(stamps_ns)
+    steady = np.ones(count, dtype=bool)
+    for index in range(count):
+        first, last = max(0, index - _NEIGHBOURS), min(count, index + _NEIGHBOURS + 1)
+        others = [other for other in range(first, last) if other != index]
+        apart_s = np.abs(stamps_ns[others] - stamps_ns[index]) / NANOSECONDS
+        angles = np.array([_angle(T_cam_board[index], T_cam_board[other]) for other in others])
+        like = angles < _STEADY_RAD + _STEADY_RATE * apart_s
+        steady[index] = like.sum() >= 0.5 * len(others)
+    return steady
 
 
 def _without_outliers(

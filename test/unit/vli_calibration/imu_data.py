@@ -31,7 +31,7 @@ def rest(duration_s: float, seed: int, noise: ImuCalibration = NOISE) -> tuple[n
     count = int(duration_s * RATE_HZ)
     gyro = errors(rng, count, noise.gyroscope_noise_density, noise.gyroscope_random_walk, 0.006)
     accel = errors(rng, count, noise.accelerometer_noise_density, noise.accelerometer_random_walk, 0.08)
-    return START_NS + np.arange(count) * 5_000_000, np.hstack([gyro, accel + [0.3, -0.2, 9.8]])
+    return START_NS + np.arange(count) * 5_000_000, np.hstack([gyro, accel + np.array([0.3, -0.2, 9.8])])
 
 
 def errors(rng: np.random.Generator, count: int, white: float, walk: float, bias: float) -> np.ndarray:
@@ -119,7 +119,7 @@ def moving(
     imu_s = np.arange(-0.2, duration_s + 0.2, 1 / RATE_HZ)
     state = trajectory.imu(imu_s)
     R_world_imu = state.T_world_imu[:, :3, :3]
-    force = np.einsum("nji,nj->ni", R_world_imu, state.acceleration + [0.0, 0.0, gravity])
+    force = np.einsum("nji,nj->ni", R_world_imu, state.acceleration + np.array([0.0, 0.0, gravity]))
     gyro = errors(rng, len(imu_s), NOISE.gyroscope_noise_density, NOISE.gyroscope_random_walk, 0.006)
     accel = errors(rng, len(imu_s), NOISE.accelerometer_noise_density, NOISE.accelerometer_random_walk, 0.08)
     frame_s = np.arange(0.01, duration_s, 1 / frame_hz)
