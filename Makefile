@@ -15,7 +15,7 @@ REDUCE := import sys, cv2; whole = cv2.imread(sys.argv[1]); \
 # Tests start ROS graphs of their own: they must not meet those of others on the network.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 
-.PHONY: demo test test-all lint format bench bench-estimator bench-goals bench-scenes pictures venv config lock clean
+.PHONY: demo test test-all lint format bench bench-estimator bench-goals bench-calibration bench-scenes pictures calibration-pictures venv config lock clean
 
 demo: venv
 	$(BIN)/vli demo
@@ -76,6 +76,14 @@ bench-estimator: venv
 # Accuracy against the project's goals; makes its recordings first.
 bench-goals: venv
 	$(BIN)/python test/perf/goals.py
+
+# The whole table of real and simulated sets; under an hour on two idle cores.
+bench-calibration: venv
+	$(BIN)/python test/perf/bench_calibration.py --full
+
+# The pictures of docs/calibration.md.
+calibration-pictures: venv
+	$(BIN)/python docs/calibration_pictures.py docs/images
 
 bench-scenes: venv
 	$(BIN)/python test/perf/scenes.py
