@@ -23,6 +23,10 @@ setup(
         "opencv-python-headless>=4.6,<5",
         "scipy>=1.11",
     ],
+    extras_require={
+        "export": ["laspy[lazrs]>=2.5", "pye57>=0.4"],
+        "mesh": ["scikit-image>=0.22", "trimesh>=4.0"],
+    },
     zip_safe=False,
     entry_points={
         "console_scripts": [

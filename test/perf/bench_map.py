@@ -143,7 +143,7 @@ def print_times(timed: Timed) -> None:
 
 def print_accuracy(mapper: Mapper, data: Path) -> None:
     """Print the figures of docs/evaluation for a map in the frame of the truth."""
-    cloud = mapper.map.cloud()
+    cloud = mapper.map.cloud(light=mapper.light(), as_seen=True)
     surface = surface_figures(surface_distances(cloud.points.astype(np.float64), read_surface(data / "surface.ply")))
     seen = read_cloud(data / "seen.ply")
     covered, nearest = nearest_map_points(seen.points, cloud.points)

@@ -22,7 +22,9 @@ from vli_bringup.warm_up import warm_up
 from vli_common.calibration import load_calibration
 from vli_common.types import NANOSECONDS, EncodedImage, ImuSample, Mode
 from vli_driver.bag import BagReader
+from vli_mapping.map_file import SUFFIX, save_map
 from vli_mapping.render import write_views
+from vli_mapping.snapshot import take
 from vli_mapping.store import write_ply
 
 NEVER_TRACKED = 1
@@ -109,6 +111,7 @@ def write(directory: Path, pipeline: Pipeline, recorder: Recorder, clock: Clock,
     recorder.write(directory)
     cloud = pipeline.stages.mapper.cloud()
     write_ply(directory / "map.ply", cloud)
+    save_map(directory / f"map{SUFFIX}", take(pipeline.stages.mapper.map, pipeline.stages.mapper.light()))
     write_views(directory / "cloud.png", cloud)
     pipeline.timer.write(directory / "timing.csv")
     (directory / "config.yaml").write_text(to_yaml(settings))

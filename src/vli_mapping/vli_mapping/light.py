@@ -108,16 +108,20 @@ class Sightings:
 
 
 class LightEstimator:
-    """Collects spots over a whole scan, a bounded number, and fits the light to them when it is asked for."""
+    """Collects spots over a whole scan, a bounded number, and fits the light to them when it is asked for.
 
-    def __init__(self) -> None:
+    Args:
+        latest: what is known already.
+    """
+
+    def __init__(self, latest: Light | None = None) -> None:
         self._chunks: list[Sightings] = []
         self.spots = 0
         """Kept, of those that were offered."""
         self._offered = 0
         self._stride = 1
         self._fitted = 0
-        self.latest: Light | None = None
+        self.latest = latest
         """As of the last fit."""
 
     def add(self, sightings: Sightings) -> None:

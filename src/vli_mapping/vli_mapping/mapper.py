@@ -12,6 +12,7 @@ from vli_mapping.config import AS_SEEN, MappingConfig
 from vli_mapping.light import Light, LightEstimator
 from vli_mapping.point_map import PointMap, Stripe, to_bytes
 from vli_mapping.scan_window import PosedScan, ScanWindow
+from vli_mapping.snapshot import Snapshot, restore
 
 _REFINE_DELAY = 3
 """Scans that enter after one before its normals are fitted again: by then the surface around it is there."""
@@ -36,6 +37,7 @@ class Mapper:
         self._window = ScanWindow(calibration.camera, self.config, self.counters)
         self._unrefined: list[tuple[IntArray, FloatArray]] = []
         self._light = LightEstimator()
+        self._is_foreign = False
 
     def add_image(self, image: Image) -> None:
         """Take a long image, for colour."""
@@ -57,7 +59,7 @@ class Mapper:
         self._window.update(window)
         touched = self._enter_leaving()
         constraints = None
-        if self.constrains:
+        if self.constrains and not self._is_foreign:
             staying = self._window.staying()
             constraints = associate(self.map, staying, window.stamp_ns, self.config.association, self.counters, session)
         cloud = _live_cloud(self._window.unpublished(), window.stamp_ns, session)
@@ -80,12 +82,23 @@ class Mapper:
         """Return the light on board and the lens as all scans so far tell of them; None while they tell too little."""
         return self._light.fit()
 
+    def adopt(self, snapshot: Snapshot) -> None:
+        """Take a map of an earlier session in place of this one's.
+
+        Poses of now and of then share no frame: until the next reset, no scan enters, and none is related to the map.
+        """
+        self.map = restore(snapshot, self.config.map)
+        self._light = LightEstimator(snapshot.light)
+        self._unrefined.clear()
+        self._is_foreign = True
+
     def reset(self, session: int) -> None:
         """Drop all that belongs to another session, and start a new map: poses of two sessions share no frame.
 
         The old map stays intact for whoever holds it.
         """
         self.counters.add("sessions")
+        self._is_foreign = False
         if len(self.map):
             self.map = PointMap(self.config.map)
         self._unrefined.clear()
@@ -94,6 +107,9 @@ class Mapper:
 
     def _enter_leaving(self) -> IntArray:
         """Enter the scans that leave the window; return the map points they became or joined, ascending."""
+        if self._is_foreign:
+            self.counters.add("scans_beside_a_loaded_map", sum(1 for _ in self._window.leaving()))
+            return np.empty(0, np.int64)
         self._light.add(self._window.sightings())
         touched = [np.empty(0, np.int64), *(self._enter(item) for item in self._window.leaving())]
         return self.map.alive(np.unique(np.concatenate(touched)))

@@ -12,7 +12,7 @@ from vli_mapping.config import MapConfig
 from vli_mapping.insertion import FREE, ROWS, insert_stripe
 from vli_mapping.light import Light
 from vli_mapping.normals import refine_normals, smooth_normals
-from vli_mapping.spatial_hash import NONE, SpatialHash
+from vli_mapping.spatial_hash import NONE, SpatialHash, link
 from vli_mapping.thinning import thin
 
 CELL_M = 8e-4
@@ -220,6 +220,16 @@ class PointMap:
             gain = light.shading(points, np.einsum("nji,nj->ni", view[:, :, :3], normals))
         result: Float32Array = (c.colour[which] / gain[:, None]).astype(np.float32)
         return result
+
+    def fill(self, columns: Columns, views: FloatArray) -> None:
+        """Take the points of other columns, all rows of which hold one, into a map that is empty, as they are."""
+        count = len(columns.weight)
+        self._reserve(count)
+        for item in fields(columns):
+            getattr(self.columns, item.name)[:count] = getattr(columns, item.name)
+        link(self.grid.heads, self.grid.next, self.columns.position, 0, count, CELL_M)
+        self._state[ROWS] = count
+        self.views = views.copy()
 
     def _keep_view(self, stripe: Stripe) -> None:
         if stripe.number >= len(self.views):

@@ -1,8 +1,10 @@
-"""Files of a map."""
+"""Files that are there whole or not at all."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from vli_common import ply
@@ -16,12 +18,24 @@ def write_ply(path: Path, cloud: PointCloud) -> None:
     Raises:
         OutputError: the file cannot be written; what was at ``path`` before is still there.
     """
-    partial = path.with_name(f"{path.name}.partial")
-    try:
+    with replacing(path) as partial:
         ply.write_cloud(partial, cloud)
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Give a path to write to, which takes the place of ``path`` when the block ends well, and is removed when not.
+
+    Raises:
+        OutputError: the block raised an ``OSError`` (no such directory, disk full), or the file cannot be renamed.
+    """
+    # The ending stays: libraries choose the format by it.
+    partial = path.with_name(f"{path.name}.partial{path.suffix}")
+    try:
+        yield partial
         os.replace(partial, path)
     except OSError as error:
-        raise OutputError(f"'{path}' cannot be written: {error.strerror}") from error
+        raise OutputError(f"'{path}' cannot be written: {error.strerror or error}") from error
     finally:
         _remove(partial)
 

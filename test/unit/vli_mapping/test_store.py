@@ -37,7 +37,7 @@ def test_a_file_that_cannot_be_written_leaves_the_old_one(
     before = path.read_bytes()
 
     def full(*_: object) -> None:
-        (tmp_path / "map.ply.partial").write_bytes(b"half")
+        (tmp_path / "map.ply.partial.ply").write_bytes(b"half")
         raise OutputError(f"'{path}' cannot be written: No space left on device")
 
     monkeypatch.setattr("vli_common.ply.write_cloud", full)

@@ -1,0 +1,149 @@
+"""The file of a whole map, from which it can be used again: a zip of plain arrays and a header; nothing in it is code.
+
+``header.json`` has format, version, number of points and the light on board; each column of the map is a ``.npy`` beside it. The
+zip's CRC-32 of every entry is checked when it is read. Entries are stored, not compressed: a map is noise to a compressor.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+from collections.abc import Iterator
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vli_common.arrays import AnyArray
+from vli_common.errors import InputError
+from vli_mapping.light import Light
+from vli_mapping.point_map import Columns
+from vli_mapping.snapshot import Snapshot
+from vli_mapping.store import replacing
+
+FORMAT, VERSION = "vli-map", 1
+SUFFIX = ".vli"
+_HEADER = "header.json"
+_EPOCH = (1980, 1, 1, 0, 0, 0)
+"""Of every entry: the same map is the same file."""
+_VIEWS = "views"
+
+
+def save_map(path: Path, snapshot: Snapshot) -> None:
+    """Write a map, whole or not at all.
+
+    Raises:
+        OutputError: the file cannot be written; what was at ``path`` before is still there.
+    """
+    header = {
+        "format": FORMAT,
+        "version": VERSION,
+        "points": len(snapshot),
+        "views": len(snapshot.views),
+        "light": None if snapshot.light is None else _light_to_json(snapshot.light),
+    }
+    with replacing(path) as partial, partial.open("wb") as stream:
+        with zipfile.ZipFile(stream, "w", zipfile.ZIP_STORED) as archive:
+            archive.writestr(zipfile.ZipInfo(_HEADER, _EPOCH), json.dumps(header, indent=1))
+            for name, array in _arrays(snapshot):
+                with archive.open(zipfile.ZipInfo(f"{name}.npy", _EPOCH), "w", force_zip64=True) as entry:
+                    np.lib.format.write_array(entry, array, allow_pickle=False)
+        stream.flush()
+        os.fsync(stream.fileno())
+
+
+def load_map(path: Path) -> Snapshot:
+    """Read a map.
+
+    Raises:
+        InputError: no such file, no map, of another version, or damaged.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            header = _read_header(path, archive)
+            columns = {name: _read_array(archive, name) for name in (*_names(), _VIEWS)}
+        light = None if header["light"] is None else _light_from_json(header["light"])
+    except zipfile.BadZipFile as error:
+        raise InputError(
+            f"'{path}' is no map or a damaged one ({error}), expected what 'vli run' writes as 'map{SUFFIX}'"
+        ) from error
+    except OSError as error:
+        raise InputError(f"'{path}' cannot be read: {error.strerror or error}") from error
+    except (KeyError, ValueError, TypeError, EOFError, RuntimeError, NotImplementedError) as error:
+        raise InputError(f"map '{path}' is damaged ({error}); save it again") from error
+    return _checked(path, header, columns, light)
+
+
+def is_map(path: Path) -> bool:
+    """Return True where the file starts like a map of :func:`save_map`; False too where there is none."""
+    try:
+        return zipfile.is_zipfile(path)
+    except OSError:
+        return False
+
+
+def _names() -> tuple[str, ...]:
+    return tuple(item.name for item in fields(Columns))
+
+
+def _arrays(snapshot: Snapshot) -> Iterator[tuple[str, AnyArray]]:
+    yield from ((name, getattr(snapshot.columns, name)) for name in _names())
+    yield _VIEWS, snapshot.views
+
+
+def _read_header(path: Path, archive: zipfile.ZipFile) -> dict[str, Any]:
+    if _HEADER not in archive.namelist():
+        raise InputError(f"'{path}' is no map: it has no '{_HEADER}', expected what 'vli run' writes as 'map{SUFFIX}'")
+    header = json.loads(archive.read(_HEADER))
+    if not isinstance(header, dict) or header.get("format") != FORMAT:
+        raise InputError(f"'{path}' is no map: its header does not say '{FORMAT}'")
+    if header.get("version") != VERSION:
+        raise InputError(
+            f"map '{path}' has version '{header.get('version')}', this program reads '{VERSION}'; scan again or update"
+        )
+    return header
+
+
+def _read_array(archive: zipfile.ZipFile, name: str) -> AnyArray:
+    with archive.open(f"{name}.npy") as entry:
+        array: AnyArray = np.lib.format.read_array(entry, allow_pickle=False)
+        if entry.read(1):
+            raise ValueError(f"'{name}' is longer than it says")
+    return array
+
+
+def _checked(path: Path, header: dict[str, Any], arrays: dict[str, AnyArray], light: Light | None) -> Snapshot:
+    """Return the snapshot, if every array is what the map would have written."""
+    views = arrays.pop(_VIEWS)
+    count = len(arrays["weight"])
+    wanted = Columns.empty(0)
+    for name, array in arrays.items():
+        model: AnyArray = getattr(wanted, name)
+        if array.dtype != model.dtype or array.shape != (count, *model.shape[1:]):
+            raise InputError(f"map '{path}' is damaged: '{name}' is '{array.dtype}{list(array.shape)}'; save it again")
+    columns = Columns(**arrays)
+    whole = views.dtype == np.float64 and views.shape[1:] == (3, 4) and count == header.get("points")
+    if not whole or (count and not 0 <= columns.seen_by.min() <= columns.seen_by.max() < len(views)):
+        raise InputError(f"map '{path}' is damaged: its points and views do not belong together; save it again")
+    if not (np.isfinite(columns.position).all() and (columns.weight > 0).all()):
+        raise InputError(f"map '{path}' is damaged: it has points that are nowhere; save it again")
+    return Snapshot(columns, views, light)
+
+
+def _light_to_json(light: Light) -> dict[str, Any]:
+    return {
+        "position": light.position.tolist(),
+        "ambient": light.ambient,
+        "vignetting": list(light.vignetting),
+        "reference_m": light.reference_m,
+    }
+
+
+def _light_from_json(values: dict[str, Any]) -> Light:
+    first, second = map(float, values["vignetting"])
+    position = np.array(values["position"], np.float64)
+    if position.shape != (3,):
+        raise ValueError("the light has no place")
+    return Light(position, float(values["ambient"]), (first, second), float(values["reference_m"]))
