@@ -16,6 +16,7 @@ from tiny_bag import TinyBag
 
 from vli_bringup.cli import main
 from vli_common.calibration import load_calibration
+from vli_common.geometry import inverse, so3_log
 from vli_common.types import Mode
 
 BOARD = "chessboard:9x6:0.005"
@@ -110,6 +111,22 @@ def test_check_finds_the_board_flat(simulated, calibrated, tmp_path, capsys):
     assert main([*map(str, words), "--report", str(tmp_path / "check")]) == 0
     assert "good" in capsys.readouterr().out
     assert (tmp_path / "check" / "report.html").is_file()
+
+
+@pytest.mark.slow
+def test_camera_against_imu_from_a_moving_board(tmp_path):
+    words = ["simulate", "board", "--out", tmp_path / "set", "--seed", "3", "--parts", "bag", "--duration", "12"]
+    assert main([*map(str, words), "--resolution", "320x240"]) == 0
+    assert (
+        calibrate("imu-camera", tmp_path / "set" / "bag", tmp_path / "c.yaml", "--calib", tmp_path / "set" / "calibration.yaml")
+        == 0
+    )
+    found = load_calibration(tmp_path / "c.yaml", Mode.VI)
+    truth = load_calibration(tmp_path / "set" / "calibration.yaml", Mode.VI)
+    error = inverse(truth.T_cam_imu) @ found.T_cam_imu
+    assert np.linalg.norm(so3_log(error[:3, :3])) < np.deg2rad(0.1)
+    assert np.linalg.norm(error[:3, 3]) < 1e-3
+    assert abs(found.timeshift_ns - truth.timeshift_ns) < 300_000
 
 
 def test_a_board_is_printed(tmp_path):
