@@ -22,7 +22,7 @@ SUMMARY_KEYS = {
     "ms_per_frame_mean", "ms_per_frame_p95",
 }  # fmt: skip
 FILES = {
-    "trajectory.tum", "trajectory_final.tum", "covariance.csv", "map.ply", "cloud.png", "timing.csv", "config.yaml",
+    "trajectory.tum", "trajectory_final.tum", "covariance.csv", "map.ply", "map.vli", "cloud.png", "timing.csv", "config.yaml",
     "summary.json",
 }  # fmt: skip
 DURATION_S = 7.0
