@@ -7,6 +7,7 @@ import importlib
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "camera": ("camera", "intrinsics and lens distortion from images of a flat target"),
+    "check": ("check", "how far to trust a calibration, from the stripe on a flat target"),
     "imu": ("imu", "noise densities and random walks of an IMU from hours at rest"),
     "imu-camera": ("imu_camera", "rotation, translation and time offset between camera and IMU from a moving board"),
     "laser": ("laser", "the laser plane from images of a flat target with the stripe on it"),

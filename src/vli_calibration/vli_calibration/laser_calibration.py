@@ -195,10 +195,7 @@ def _agreeing_views(
     """Return the views to solve with, the images left out because they disagree, and the RMS with fixed board poses, metres."""
     correlation = float(np.median([scene.stripe.correlation for scene in scenes if scene.stripe]))
     views = [view for scene in scenes if (view := _view(scene, target, correlation, arm)) is not None]
-    striped = [view for view in views if len(view.stripe) and view.prior is None]
-    points = _image_points(
-        striped, camera, along_columns, {scene.name for scene in scenes if scene.stripe and scene.stripe.on_print}
-    )
+    points = _image_points(scenes, camera, along_columns, correlation)
     _check_spread(points)
     agreeing, out = agreeing_images(points, LEAST_IMAGES)
     reasons = [
@@ -211,8 +208,9 @@ def _agreeing_views(
     ]
     plane = fit_images(agreeing)
     names = {item.name for item in out}
-    rms = _rms(plane.distance(np.concatenate([item.points for item in agreeing])))
-    return [view for view in views if view.name not in names], reasons, rms
+    used = [view for view in views if view.name not in names]
+    met = [stripe_points(camera, view.T_cam_board, view.stripe) for view in used if view.prior is None]
+    return used, reasons, _rms(plane.distance(np.concatenate(met)))
 
 
 def _view(scene: LaserScene, target: Target, correlation: float, arm: HandEye | None) -> LaserView | None:
@@ -230,15 +228,25 @@ def _view(scene: LaserScene, target: Target, correlation: float, arm: HandEye | 
     )
 
 
-def _image_points(views: Sequence[LaserView], camera: CameraModel, along_columns: bool, sure: set[str]) -> list[ImagePoints]:
-    met = [stripe_points(camera, view.T_cam_board, view.stripe) for view in views]
-    plane = fit_plane_robust(np.concatenate(met))
-    result = []
-    for view, points in zip(views, met, strict=True):
-        poses = np.broadcast_to(view.T_cam_board, (len(points), 4, 4))
-        sigmas = stripe_sigmas(camera, poses, points, view.sigma_px, plane, int(along_columns))
-        result.append(ImagePoints(view.name, points, sigmas, view.correlation, view.name in sure))
-    return result
+def _image_points(
+    scenes: Sequence[LaserScene], camera: CameraModel, along_columns: bool, correlation: float
+) -> list[ImagePoints]:
+    """Return where the stripe of each image meets its board; all points, for what is off its line speaks against an image too."""
+    both = [(scene.name, scene.board, scene.stripe) for scene in scenes]
+    met = [
+        (name, stripe, np.broadcast_to(board.T_cam_board, (len(stripe), 4, 4)))
+        for name, board, stripe in both
+        if board is not None and stripe is not None
+    ]
+    points = [stripe_points(camera, poses, stripe.pixels) for _, stripe, poses in met]
+    plane = fit_plane_robust(np.concatenate(points))
+    return [
+        ImagePoints(
+            name, of_image, stripe_sigmas(camera, poses, of_image, stripe.sigma_px, plane, int(along_columns)), correlation,
+            stripe.on_print,
+        )
+        for (name, stripe, poses), of_image in zip(met, points, strict=True)
+    ]  # fmt: skip
 
 
 def _check_spread(points: Sequence[ImagePoints]) -> None:
@@ -247,7 +255,7 @@ def _check_spread(points: Sequence[ImagePoints]) -> None:
     if across < _LEAST_SPREAD * depth:
         raise InputError(
             f"the stripes of all images lie on nearly one line (spread '{1e3 * across:.2f}' mm across it at {1e3 * depth:.0f} "
-            "mm), which leaves the plane free to turn about it; take views at several distances and with the board tilted both ways"
+            "mm), which leaves the plane free to turn about it; take views at several distances, tilted both ways"
         )
 
 

@@ -287,7 +287,8 @@ def solve_reduced(hessian: FloatArray, right: FloatArray) -> FloatArray:
         scaled = np.linalg.solve(hessian * np.outer(scale, scale), (right.T * scale).T)
     except np.linalg.LinAlgError:
         raise InputError(f"the views do not determine camera and laser plane; {MORE_VIEWS}") from None
-    return np.asarray((scaled.T * scale).T, np.float64)
+    result: FloatArray = np.asarray((scaled.T * scale).T)
+    return result
 
 
 def _damped(hessian: FloatArray, damping: float) -> FloatArray:

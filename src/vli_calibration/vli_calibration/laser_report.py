@@ -1,7 +1,8 @@
-"""The report of ``vli calibrate laser``: tables, drawings, pictures of what was rejected, verdict, and the figures for machines."""
+"""The report of ``vli calibrate laser``: tables, drawings, pictures of what was rejected, verdict, and figures for machines."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -73,7 +74,7 @@ def distance_rows(depths: FloatArray, errors: FloatArray) -> list[tuple[str, int
         return []
     edges = np.quantile(depths, np.linspace(0, 1, _BINS + 1))
     rows = []
-    for index, (low, high) in enumerate(zip(edges[:-1], edges[1:], strict=True)):
+    for index, (low, high) in enumerate(itertools.pairwise(edges)):
         inside = (depths >= low) & ((depths < high) if index < _BINS - 1 else (depths <= high))
         if inside.any():
             text = f"{_MM * low:.0f} to {_MM * high:.0f} mm"
@@ -94,7 +95,8 @@ def verdict(fit: LaserFit) -> tuple[Verdict, str]:
     depth = float(np.median(np.concatenate([item.depths[item.kept] for item in fit.residuals])))
     tilt, shift = np.degrees(fit.tilt_rad), fit.half_widths[3] / depth
     loo = fit.loo_depth_rms_m / depth
-    worth = f"{len(fit.residuals)} images, plane known to ± {tilt:.2f}° and ± {_MM * fit.half_widths[3]:.2f} mm, depth to {100 * loo:.1f} %"
+    known = f"± {tilt:.2f}° and ± {_MM * fit.half_widths[3]:.2f} mm"
+    worth = f"{len(fit.residuals)} images, plane known to {known}, depth to {100 * loo:.1f} %"
     advice = remarks(fit)
     if tilt <= _GOOD_TILT_DEG and shift <= _GOOD_SHIFT and loo <= _GOOD_LOO and len(fit.residuals) >= _GOOD_IMAGES:
         return Verdict.GOOD, worth
@@ -113,13 +115,16 @@ def remarks(fit: LaserFit) -> list[str]:
                     f"{1.5 * far:.0f} mm")  # fmt: skip
     if np.degrees(fit.tilt_rad) > _GOOD_TILT_DEG:
         told.append(
-            f"the plane's tilt is known to ± {np.degrees(fit.tilt_rad):.2f}° only: take more tilted views at {near:.0f}–{far:.0f} mm"
+            f"the plane's tilt is known to ± {np.degrees(fit.tilt_rad):.2f}° only: take more tilted views at "
+            f"{near:.0f}–{far:.0f} mm"
         )
     if len(fit.residuals) < _GOOD_IMAGES:
         told.append(f"{len(fit.residuals)} images show the stripe: take {_GOOD_IMAGES} or more")
     if fit.points_used < 0.8 * fit.points_total:
-        told.append(f"{fit.points_total - fit.points_used} of {fit.points_total} stripe points do not fit: keep the board flat and the "
-                    "stripe from being overexposed")  # fmt: skip
+        lost = fit.points_total - fit.points_used
+        told.append(
+            f"{lost} of {fit.points_total} stripe points do not fit: keep the board flat and the stripe from being overexposed"
+        )
     if not fit.camera_refined:
         told.append("the camera was held as given: the intervals leave its own uncertainty out")
     return told
@@ -197,19 +202,21 @@ def make_report(fit: LaserFit) -> Report:
                  "Depth by the plane of all other images, less that of the board.")  # fmt: skip
     report.figure(_by_depth(depths, errors), "Each stripe point of an image, by the calibration without that image.")
     report.heading("Residuals along the stripe")
-    report.figure(_along(fit), "Distance of the kept points from the plane along the stripe, one line an image: what they have in common is "
-                  "the lens or the laser's own bend.")  # fmt: skip
+    report.figure(_along(fit), "Distance of the kept points from the plane along the stripe, one row of dots an image: what "
+                  "they have in common is the lens or the laser's own bend.")  # fmt: skip
     report.heading("Coverage")
     report.figure(_coverage(fit), "Where the stripes lie in the image, coloured by depth.")
     if fit.table is not None:
         report.heading("One flat table through the arm")
-        report.figure(_table(fit), f"Mean and spread of each image's points about one plane: RMS {_MM * fit.table.rms_m:.3f} mm. It holds the "
-                      "errors of arm, hand–eye, lens and plane together.")  # fmt: skip
+        caption = f"Mean and spread of each image's points about one plane: RMS {_MM * fit.table.rms_m:.3f} mm."
+        report.figure(_table(fit), f"{caption} It holds the errors of arm, hand–eye, lens and plane together.")
     report.heading("Images")
     report.table(IMAGE_HEADER, image_rows(fit), "Left out: depth error by the calibration without the image.")
     _rejected(report, fit)
-    report.paragraph("The sheet is taken to be flat round the print, for the print's shorter side in each direction. Intervals take the "
-                     "images as the samples, not the points.")  # fmt: skip
+    report.paragraph(
+        "The sheet is taken to be flat round the print, for the print's shorter side in each direction. Intervals take the "
+        "images as the samples, not the points."
+    )
     return report
 
 
@@ -259,7 +266,8 @@ def _along(fit: LaserFit) -> Figure:
 
 
 def _position(fit: LaserFit, item: StripeResidual) -> FloatArray:
-    return item.pixels[item.kept, 0 if fit.along_columns else 1]
+    position: FloatArray = item.pixels[item.kept, 0 if fit.along_columns else 1]
+    return position
 
 
 def _coverage(fit: LaserFit) -> Figure:

@@ -32,6 +32,11 @@ class StripeLine:
     inliers: BoolArray
     scatter_px: float
 
+    @property
+    def tolerance_px(self) -> float:
+        """How far from the line a point of it may be."""
+        return max(_OUTLIER_SIGMAS * self.scatter_px, _LEAST_TOLERANCE_PX)
+
 
 def bearings(camera: CameraModel, pixels: FloatArray) -> FloatArray:
     """Return unit viewing directions (N, 3) of raw pixels (N, 2); NaN where the lens model has none."""
@@ -58,14 +63,30 @@ def fit_stripe_line(
         return None
     directions = np.where(valid[:, None], directions, 0.0)
     inliers = start & _largest_consensus(directions, np.flatnonzero(start), tolerance_px / camera.focal_px)
-    normal, residuals, scatter = np.zeros(3), np.full(len(pixels), np.inf), 0.0
+    tolerance: float | None = None
+    line: StripeLine | None = None
+    for candidates in (start, valid):
+        line = _refined(directions, candidates, inliers, camera.focal_px, tolerance)
+        if line is None:
+            return None
+        # What joins the sure points has to keep to their scatter, else it would bend the line to itself.
+        inliers, tolerance = line.inliers, line.tolerance_px
+    return line
+
+
+def _refined(
+    directions: FloatArray, candidates: BoolArray, inliers: BoolArray, focal_px: float, tolerance: float | None
+) -> StripeLine | None:
+    """Return the trimmed least-squares line of the candidates (N,), None where fewer than three stay."""
+    normal, residuals, scatter = np.zeros(3), np.full(len(directions), np.inf), 0.0
     for _ in range(_REFINEMENTS):
         if inliers.sum() < 3:
             return None
         normal = np.linalg.svd(directions[inliers], full_matrices=False)[2][2]
-        residuals = np.where(valid, directions @ normal * camera.focal_px, np.inf)
+        residuals = np.where(np.any(directions != 0, axis=1), directions @ normal * focal_px, np.inf)
         scatter = 1.4826 * float(np.median(np.abs(residuals[inliers])))
-        previous, inliers = inliers, np.abs(residuals) <= max(_OUTLIER_SIGMAS * scatter, _LEAST_TOLERANCE_PX)
+        limit = max(_OUTLIER_SIGMAS * scatter, _LEAST_TOLERANCE_PX) if tolerance is None else tolerance
+        previous, inliers = inliers, candidates & (np.abs(residuals) <= limit)
         if (inliers == previous).all():
             break
     return StripeLine(normal, residuals, inliers, scatter)

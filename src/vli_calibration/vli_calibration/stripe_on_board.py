@@ -23,7 +23,7 @@ from vli_driver.stripe import CentreOfMassDetector, StripePoints
 from vli_driver.triangulation import full_band
 
 CHANNELS = ("blue", "green", "red")
-_WIDTHS_PX = (12.0, 24.0, 48.0, 96.0)
+_WIDTHS_PX = (6.0, 12.0, 24.0, 48.0, 96.0)
 """Widest lines sought, at half height."""
 _OPENING = 2.6
 """Length of the top-hat over the widest line: the foot of a line is some twice as wide as its half height."""
@@ -34,6 +34,7 @@ _MOST_SMOOTHING_PX = 5.0
 _MAX_LEAN = 0.1
 """Looser than in the driver: a square's edge under the line makes it lean, and the straight line tells what is wrong with it."""
 _MIN_LENGTH = 0.12
+_ELSEWHERE = 2.0
 _SURE_POINTS = 20
 _MIN_FILL = 0.4
 _MAX_SCATTER = 0.1
@@ -50,7 +51,7 @@ class BoardStripe:
     """The stripe of one image.
 
     Args:
-        pixels: (N, 2) raw u, v of all points detected on the surface, up to a line width off the line: further off is another.
+        pixels: (N, 2) raw u, v of all points detected on the surface; far off the line is another surface.
         sigma_px: (N,) across the stripe, one sigma of noise and speckle, and of what lens model, paper and print leave.
         correlation: number of neighbours that err together: integrated autocorrelation of the residuals along the line.
         line: the straight line through them, and which points lie on it.
@@ -114,10 +115,11 @@ class StripeFinder:
 
     def find(self, scene: Scene) -> BoardStripe | None:
         """Return the stripe, None where there is none."""
-        limit = np.inf if scene.surface is None else max(scene.surface.square_px, _OPENING * _WIDTHS_PX[0])
+        limit = np.inf if scene.surface is None else max(scene.surface.square_px, _OPENING * _WIDTHS_PX[1])
         limit = min(limit, 0.5 * min(self.camera.width, self.camera.height))
         found = [self._find(scene, width) for width in _WIDTHS_PX if _OPENING * width <= limit]
-        return max((stripe for stripe in found if stripe is not None), key=lambda stripe: stripe.kept.sum(), default=None)
+        stripes = [stripe for stripe in found if stripe is not None]
+        return max(stripes, key=lambda stripe: (stripe.on_print, int(stripe.kept.sum())), default=None)
 
     def _find(self, scene: Scene, width_px: float) -> BoardStripe | None:
         points = self._detect(scene.pixels, width_px)
@@ -131,7 +133,7 @@ class StripeFinder:
             return None
         sigma_px = np.hypot(points.sigma_px[inside], _LEAST_SIGMA_PX)
         correlation = correlation_length(line.residuals_px[line.inliers])
-        here = np.abs(line.residuals_px) <= width_px
+        here = np.abs(line.residuals_px) <= _ELSEWHERE * line.tolerance_px
         line = replace(line, residuals_px=line.residuals_px[here], inliers=line.inliers[here])
         return BoardStripe(pixels[here], sigma_px[here], correlation, line, sure is not None)
 

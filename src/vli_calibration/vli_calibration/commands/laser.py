@@ -65,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def known_sigmas(document: Mapping[str, Any], camera: CameraModel) -> FloatArray:
-    """Return how well each of the camera's parameters is known: by the intervals in its provenance, infinity without, zero held."""
+    """Return how well each of the camera's parameters is known by its provenance: infinity without one, zero where held."""
     sigmas = _provenance_sigmas(document, len(camera_parameters(camera)))
     if document["cam0"].get("distortion_model") == "none":
         sigmas[4:] = 0.0
