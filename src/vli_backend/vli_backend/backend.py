@@ -18,6 +18,8 @@ from vli_backend.config import BackEndConfig
 from vli_backend.dead_reckoning import DeadReckoning
 from vli_backend.depth_prior import DepthPrior
 from vli_backend.estimator import FrameResult, WindowEstimator
+from vli_backend.inertial_scale import InertialScale
+from vli_backend.laser_check import LaserCheck
 from vli_backend.placement import Placement
 from vli_backend.smoother import SmootherError, StatePrior
 from vli_backend.starter import Starter
@@ -72,6 +74,8 @@ class BackEnd:
         self._estimator: WindowEstimator | None = None
         self._new_starter = starter
         self._starter = starter(calibration, config, mode)
+        self._laser_check = LaserCheck(calibration, config, mode)
+        self._inertial_scale = InertialScale.of_scene(calibration, config)
         self._reckoning, self._placement = DeadReckoning(), Placement()
         self._last_scan_ns, self._last_imu_ns, self._last_good_ns = 0, 0, 0
         self._last_failure_ns, self._constraints_after_ns = -_RECOVERY_NS, -1
@@ -168,6 +172,7 @@ class BackEnd:
         self.counters.add("keyframes", int(frame.tracks.keyframe))
         if result.landmarks >= self._config.min_landmarks:
             self._last_good_ns = stamp
+            self._check_scale(frame, result, estimator)
             self.state, self.reason = TrackingState.TRACKING, self._hint(stamp)
             return self._output(stamp, result)
         blind_s = (stamp - self._last_good_ns) / NANOSECONDS
@@ -181,6 +186,13 @@ class BackEnd:
             return self._lose(stamp, f"too few features for {blind_s:.1f} s: covered lens, darkness or fast motion")
         return self._output(stamp, result)
 
+    def _check_scale(self, frame: FrontEndOutput, result: FrameResult, estimator: WindowEstimator) -> None:
+        """Compare the scale with the IMU's: with the laser to watch over its plane, without it to sharpen the scale itself."""
+        if self._mode.uses_laser:
+            self._laser_check.add_frame(frame, result.pose, estimator.plane_residuals)
+        elif result.pose is not None and (piece := self._inertial_scale.add_frame(frame, result.pose)) is not None:
+            estimator.add_scale(*piece)
+
     def _hint(self, stamp_ns: int) -> str:
         """Return what is missing although it tracks, in words; empty where nothing is."""
         silent = (
@@ -190,7 +202,7 @@ class BackEnd:
         missing = [
             text.format((stamp_ns - last) / NANOSECONDS) for text, used, last in silent if used and stamp_ns - last > _MISSING_NS
         ]
-        return "; ".join([*missing, *filter(None, [self._placement.hint])])
+        return "; ".join([*missing, *filter(None, [self._placement.hint, self._laser_check.hint])])
 
     def _output(self, stamp_ns: int, result: FrameResult) -> BackEndOutput:
         pose = None if result.pose is None else self._placement.of_pose(result.pose)
@@ -246,3 +258,5 @@ class BackEnd:
         self._estimator = None
         self._starter = self._new_starter(self._calibration, self._config, self._mode)
         self._last_good_ns, self._constraints_after_ns = 0, -1
+        self._laser_check.begin_window()
+        self._inertial_scale.clear()

@@ -106,4 +106,7 @@ class BackEndConfig:
     lost_after_s: float = parameter(
         1.0, unit="s", minimum=0.05, maximum=10.0, doc="without enough landmarks for longer: LOST; longer: the IMU drifts further"
     )
+    laser_check: bool = parameter(
+        True, doc="warn where laser depths contradict what vision and IMU see: the laser plane may have moved"
+    )
     scene: SceneConfig = section(SceneConfig)

@@ -15,6 +15,7 @@ from vli_backend.frame_pose import FramePose, solve_frame_pose
 from vli_backend.landmarks import LandmarkTable
 from vli_backend.laser_depth import measure_slot
 from vli_backend.map_residuals import condense_map
+from vli_backend.plane_residuals import PlaneResiduals, plane_residuals
 from vli_backend.pose_covariance import PoseCovariance
 from vli_backend.prediction import Prediction, Predictor
 from vli_backend.smoother import Condenser, GtsamSmoother, KeyframeState, Smoother, SmootherError, StatePrior
@@ -83,10 +84,13 @@ class WindowEstimator:
         self._moving_keyframes = 0
         self._T_map_odom = np.eye(4)
         self.constraints: MapConstraints | None = None
+        self.plane_residuals: PlaneResiduals | None = None
+        """Laser depths of the landmarks that left last, compared with vision."""
 
         self._smoother.start(state, prior)
         self._state = state
         self._candidate = first, state
+        self._scale: tuple[float, float] | None = None
         self._window.append(first.stamp_ns, first.stationary, None)
         self._add_observations(first)
         self._records = [FrameRecord(first.stamp_ns, state.T_map_imu @ self._T_imu_cam, first.stationary)]
@@ -147,6 +151,10 @@ class WindowEstimator:
         pose = self._estimate(tracks.stamp_ns, found.T_map_camera, predicted.velocity, covariance, session)
         return FrameResult(pose, found.inliers)
 
+    def add_scale(self, ratio: float, sigma: float) -> None:
+        """Take how long the path is against its present scale, with a relative sigma, for the next solve."""
+        self._scale = ratio, sigma
+
     def add_start_keyframe(
         self, tracks: Tracks, state: KeyframeState, imu: gtsam.PreintegratedCombinedMeasurements | None
     ) -> None:
@@ -158,7 +166,7 @@ class WindowEstimator:
     def finish_start(self, scale_sigma: float | None = None) -> None:
         """Solve the window of a start in motion; ``scale_sigma``: how well its scale is known, relative, where no laser tells."""
         if scale_sigma is not None:
-            self._smoother.hold_scale(scale_sigma)
+            self._smoother.hold_scale(1.0, scale_sigma)
         self._solve(self._config.start_iterations)
         self._records = [
             FrameRecord(self._window.stamps[-1], self._state.T_map_imu @ self._T_imu_cam, self._window.stationary[-1])
@@ -241,9 +249,15 @@ class WindowEstimator:
 
     def _append_keyframe(self, tracks: Tracks, state: KeyframeState, imu: gtsam.PreintegratedCombinedMeasurements | None) -> None:
         elapsed_s = (tracks.stamp_ns - self._window.stamps[-1]) * 1e-9
+        still = all(record.stationary for record in self._records)
         self._window.append(tracks.stamp_ns, tracks.stationary, close_interval(self._records, self._scans))
         self._scans = [scan for scan in self._scans if scan.stamp_ns > tracks.stamp_ns]
         self._smoother.add_keyframe(state, imu, elapsed_s)
+        if still:
+            self._smoother.hold_still()
+        if self._scale is not None:
+            self._smoother.hold_scale(*self._scale)
+            self._scale = None
         self._add_observations(tracks)
         self._records = self._records[-1:]
 
@@ -307,6 +321,8 @@ class WindowEstimator:
         full = len(self._window) > self._config.window_keyframes
         message = self._window.poses(poses, int(full), session)
         if full:
+            oldest_rows = self._landmarks.arrays.anchor == 0
+            self.plane_residuals = plane_residuals(self._landmarks, oldest_rows, poses, self._config.cauchy, self._limits)
             leaving = self._landmarks.split()
             stays = self._landmarks.usable & ~leaving
             # What the map says of the oldest interval leaves with it; the rest goes on holding the window.

@@ -23,6 +23,8 @@ GRAVITY = 9.81
 """m/s²; the world's z axis points up."""
 
 _ITERATIONS = 8
+_CONVERGED = 1e-5
+"""Relative step of the scale."""
 
 
 @dataclass(frozen=True)
@@ -114,10 +116,12 @@ def align_structure(
     problem = _Problem(T_world_keyframe, intervals, lever, sigmas)
     gravity_norm = 0.0
     for iteration in range(_ITERATIONS):
-        problem.step(gravity_is_free=iteration == 0)
+        change = problem.step(gravity_is_free=iteration == 0)
         if iteration == 0:
             gravity_norm = float(np.linalg.norm(problem.gravity))
             problem.gravity *= GRAVITY / max(gravity_norm, 1e-9)
+        elif change < _CONVERGED:
+            break
     return problem.solution(gravity_norm)
 
 
@@ -138,8 +142,8 @@ class _Problem:
         self._information = np.empty((0, 0))
         self._chi = np.inf
 
-    def step(self, gravity_is_free: bool) -> None:
-        """Linearise, solve, and move; ``gravity`` keeps its length unless it is free."""
+    def step(self, gravity_is_free: bool) -> float:
+        """Linearise, solve, and move; return the relative change of the scale. ``gravity`` keeps its length unless it is free."""
         basis = np.eye(3) if gravity_is_free else _tangent_basis(self.gravity)
         head = 7 + basis.shape[1]
         width = head + 6 * self._count
@@ -157,6 +161,7 @@ class _Problem:
         step: FloatArray = np.linalg.lstsq(a, -b, rcond=None)[0].astype(np.float64)
         self._chi = float(np.sqrt(((b + a @ step) ** 2).sum() / max(1, len(b) - width)))
         self._move(step, basis, head, gravity_is_free)
+        return abs(float(step[0])) / max(abs(self._scale), 1e-9)
 
     def solution(self, gravity_norm: float) -> InertialAlignment:
         """Return what was found."""

@@ -28,6 +28,10 @@ _UNMEASURED_VELOCITY = 0.1
 """Sigma of the velocity at a keyframe without IMU, m/s: a hand in a confined space is slower."""
 
 
+_STILL = (1e-4, 3e-6)
+"""rad, m: how still a scanner at rest stands from keyframe to keyframe. Features alone leave ten times that, which adds up."""
+
+
 class SmootherError(VliError):
     """The optimiser failed (indeterminate system); the window must be damped or started anew."""
 
@@ -74,8 +78,11 @@ class Smoother(Protocol):
     def add_keyframe(self, state: KeyframeState, imu: gtsam.PreintegratedCombinedMeasurements | None, elapsed_s: float) -> None:
         """Append a keyframe with its first guess; without ``imu`` only the biases are linked to the last keyframe."""
 
-    def hold_scale(self, relative_sigma: float) -> None:
-        """Tie the largest distance between two keyframes of the window to what it is now, with a relative sigma."""
+    def hold_still(self) -> None:
+        """Tie the newest keyframe to the one before: the scanner stood still between them."""
+
+    def hold_scale(self, ratio: float, relative_sigma: float) -> None:
+        """Tie the largest distance between two keyframes of the window to ``ratio`` times its present value; relative sigma."""
 
     def solve(self, condenser: Condenser, iterations: int) -> int:
         """Iterate to convergence; return the iterations used."""
@@ -147,13 +154,21 @@ class GtsamSmoother:
         self._new_stamps |= {key: float(last) for key in (X(new), V(new), B(new))}
         self._count += 1
 
-    def hold_scale(self, relative_sigma: float) -> None:
+    def hold_still(self) -> None:
+        """See :meth:`Smoother.hold_still`; robust, as a hand that seems still may creep."""
+        newest = self._first + self._count - 1
+        base = gtsam.noiseModel.Diagonal.Sigmas(np.repeat(_STILL, 3))
+        noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Cauchy.Create(2.0), base)
+        self._new_factors.add(gtsam.BetweenFactorPose3(X(newest - 1), X(newest), gtsam.Pose3(), noise))
+
+    def hold_scale(self, ratio: float, relative_sigma: float) -> None:
         """See :meth:`Smoother.hold_scale`."""
         positions = self._poses()[:, :3, 3]
         distances = np.linalg.norm(positions[:, None] - positions, axis=2)
         i, j = np.unravel_index(int(np.argmax(distances)), distances.shape)
-        noise = gtsam.noiseModel.Isotropic.Sigma(1, relative_sigma * float(distances[i, j]))
-        self._new_factors.add(gtsam.RangeFactorPose3(X(self._first + i), X(self._first + j), float(distances[i, j]), noise))
+        distance = ratio * float(distances[i, j])
+        noise = gtsam.noiseModel.Isotropic.Sigma(1, relative_sigma * distance)
+        self._new_factors.add(gtsam.RangeFactorPose3(X(self._first + i), X(self._first + j), distance, noise))
 
     def solve(self, condenser: Condenser, iterations: int) -> int:
         """See :meth:`Smoother.solve`."""

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 
 from vli_backend.condense import Quadratic, condense, refine
@@ -25,11 +24,12 @@ from vli_backend.inertial_alignment import (
 from vli_backend.initialisation import bundle_adjust, chain_rotations
 from vli_backend.landmarks import LandmarkTable
 from vli_backend.motion_start import chain_keyframes, parallax_px
+from vli_backend.preintegrations import measurements_of
 from vli_backend.smoother import KeyframeState
 from vli_common.arrays import FloatArray
 from vli_common.calibration import Calibration
 from vli_common.geometry import interpolate, inverse, pose, rotation_between
-from vli_common.types import FrontEndOutput, Preintegration, Tracks
+from vli_common.types import FrontEndOutput, Tracks
 
 _VISUAL_ROTATION_RAD = 5e-4
 """What images leave open of a keyframe's attitude in a short window."""
@@ -69,7 +69,7 @@ def start_from_vision(
     tracks = [first, *(interval[-1].tracks for interval in intervals)]
     T_cam_imu = calibration.T_cam_imu if calibration.T_cam_imu is not None else np.eye(4)
     focal = calibration.camera.focal_px
-    rotations = chain_rotations([_measurements(interval[-1].preintegration) for interval in intervals], T_cam_imu)
+    rotations = chain_rotations([measurements_of(interval[-1].preintegration) for interval in intervals], T_cam_imu)
     parallax = parallax_px(tracks, rotations, focal)
     if parallax < config.start_parallax_px:
         return _failed(f"{parallax:.0f} px of parallax, {config.start_parallax_px:.0f} are needed: move sideways")
@@ -77,7 +77,7 @@ def start_from_vision(
     visual = [_interval(config, table, poses, k, tracks[k], interval, T_cam_imu, focal) for k, interval in enumerate(intervals)]
     depth = float(np.median(1.0 / table.arrays.rho[table.usable]))
     T_world_keyframe = pose(poses[:, :3, :3] @ T_cam_imu[:3, :3], poses[:, :3, 3])
-    sigmas = _sigmas(calibration, config, depth * _POSITION_SHARE * config.pixel_sigma / focal)
+    sigmas = alignment_sigmas(calibration, config, depth)
     found = align_structure(T_world_keyframe, visual, inverse(T_cam_imu)[:3, 3], sigmas)
     if problem := _doubt(found, config):
         return _failed(problem)
@@ -127,17 +127,18 @@ def _interval(
         )
         found.append(solved.T_map_camera)
     T = np.stack([*found, poses[k + 1]])
-    measurements = [_measurements(frame.preintegration) for frame in frames]
+    measurements = [measurements_of(frame.preintegration) for frame in frames]
     return VisualInterval(T[:, :3, 3], T[:, :3, :3] @ T_cam_imu[:3, :3], measurements)
 
 
-def _sigmas(calibration: Calibration, config: BackEndConfig, position: float) -> AlignmentSigmas:
+def alignment_sigmas(calibration: Calibration, config: BackEndConfig, depth: float) -> AlignmentSigmas:
+    """Return what goes into an alignment of a structure with the IMU; ``depth`` is that of its landmarks, in its units."""
     imu = calibration.imu
     accelerometer, gyroscope = (imu.accelerometer_noise_density, imu.gyroscope_noise_density) if imu else (2e-3, 2e-4)
     return AlignmentSigmas(
         _NOISE_FACTOR * accelerometer,
         _NOISE_FACTOR * gyroscope,
-        position,
+        depth * _POSITION_SHARE * config.pixel_sigma / calibration.camera.focal_px,
         _VISUAL_ROTATION_RAD,
         config.accel_bias_sigma,
         config.gyro_bias_sigma,
@@ -165,9 +166,3 @@ def _states(poses: FloatArray, found: InertialAlignment, lever: FloatArray) -> l
 
 def _failed(problem: str) -> VisualStart:
     return VisualStart([], 0.0, np.inf, problem)
-
-
-def _measurements(preintegration: Preintegration | None) -> gtsam.PreintegratedCombinedMeasurements:
-    if preintegration is None or not isinstance(preintegration.measurements, gtsam.PreintegratedCombinedMeasurements):
-        raise TypeError("a start without the laser takes frames with preintegration only")
-    return preintegration.measurements

@@ -36,10 +36,15 @@ def combined_params(imu: ImuCalibration, config: ImuConfig, inflate: float = 1.0
     return params
 
 
+_LEAST_STEPS = 4
+_EVEN = 1.5
+"""Longest over shortest step up to which samples count as even."""
+
+
 class Preintegrator:
     """Measurements between the last keyframe and each frame after it.
 
-    Samples are instants: each step takes the mean of its two ends, the first and the last step end at the frames' own stamps.
+    Samples are instants: each step takes the signal's mean over it, the first and the last step end at the frames' own stamps.
     Every answer is integrated afresh (1.5 µs a sample), so that it may be kept. Noise is that of the calibration, or what the
     samples show where that is clearly more.
 
@@ -92,12 +97,30 @@ class Preintegrator:
     def _integrate(self, segment: ImuSegment, inflate: float) -> gtsam.PreintegratedCombinedMeasurements:
         params = self._params if inflate == 1.0 else combined_params(self._noise.imu, self._config, inflate)
         measurements = gtsam.PreintegratedCombinedMeasurements(params, self._interval_bias)
-        accel, gyro = _midpoints(segment.accel), _midpoints(segment.gyro)
-        for a, w, dt in zip(accel, gyro, (np.diff(segment.stamps) * 1e-9).tolist(), strict=True):
+        stamps_s = (segment.stamps - segment.stamps[0]) * 1e-9
+        accel, gyro = step_means(segment.accel, stamps_s), step_means(segment.gyro, stamps_s)
+        for a, w, dt in zip(accel, gyro, np.diff(stamps_s).tolist(), strict=True):
             measurements.integrateMeasurement(a, w, dt)
         return measurements
 
 
-def _midpoints(values: FloatArray) -> FloatArray:
-    result: FloatArray = 0.5 * (values[1:] + values[:-1])
-    return result
+def step_means(values: FloatArray, stamps_s: FloatArray) -> FloatArray:
+    """Return the mean of a signal over each step between its samples: the trapezoidal rule less h²/12 times the curvature.
+
+    At 200 Hz the rule alone takes 1 % off a hand's tremor of 10 Hz, and so off the scale of a path that the IMU measures. Where
+    samples are few or a gap lies between them the curvature is not known: the rule stays.
+
+    Args:
+        values: (M, 3); the first and the last are interpolated, the others samples.
+        stamps_s: (M,) ascending.
+    """
+    steps = np.diff(stamps_s)
+    means: FloatArray = 0.5 * (values[1:] + values[:-1])
+    inner = steps[1:-1]
+    if len(inner) < _LEAST_STEPS or inner.max() > _EVEN * inner.min():
+        return means
+    slopes = np.diff(values[1:-1], axis=0) / inner[:, None]
+    curvature = np.diff(slopes, axis=0) / (0.5 * (inner[1:] + inner[:-1]))[:, None]
+    # One for each sample, the outer ones as their neighbours; then the mean over each step.
+    at_samples = np.pad(curvature, ((2, 2), (0, 0)), mode="edge")
+    return means - (steps**2)[:, None] / 12.0 * 0.5 * (at_samples[1:] + at_samples[:-1])

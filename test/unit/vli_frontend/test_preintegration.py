@@ -12,7 +12,7 @@ from vli_common.calibration import ImuCalibration
 from vli_common.geometry import so3_exp
 from vli_common.types import Counters, ImuBias, ImuSample, Preintegration
 from vli_frontend.config import ImuConfig
-from vli_frontend.preintegration import Preintegrator, combined_params
+from vli_frontend.preintegration import Preintegrator, combined_params, step_means
 from vli_frontend.synchroniser import Synchroniser
 
 MS = 1_000_000
@@ -137,3 +137,21 @@ def test_noise_is_that_of_the_calibration_times_the_factors() -> None:
 def test_an_accelerometer_worse_than_the_floor_keeps_its_own_noise() -> None:
     noisy = ImuCalibration(200.0, 0.1, 3e-4, 2.4e-4, 2e-5)
     np.testing.assert_allclose(combined_params(noisy, ImuConfig()).getAccelerometerCovariance(), np.eye(3) * 0.01)
+
+
+def test_the_mean_over_a_step_does_not_lose_amplitude_at_the_frequencies_of_a_hand() -> None:
+    omega, stamps = 2 * np.pi * 10.0, np.concatenate([[0.0], 0.002 + 0.005 * np.arange(40), [0.199]])
+    values = np.repeat(np.sin(omega * stamps)[:, None], 3, axis=1)
+    true = -np.diff(np.cos(omega * stamps)) / omega / np.diff(stamps)
+    rule = 0.5 * (values[1:, 0] + values[:-1, 0])
+    found = step_means(values, stamps)[:, 0]
+    inner = slice(2, -2)
+    assert np.abs(found - true)[inner].max() < 0.1 * np.abs(rule - true)[inner].max()
+
+
+def test_a_gap_or_few_samples_leave_the_trapezoidal_rule() -> None:
+    values = np.random.default_rng(0).normal(size=(12, 3))
+    rule = 0.5 * (values[1:] + values[:-1])
+    gap = np.concatenate([0.005 * np.arange(6), 0.08 + 0.005 * np.arange(6)])
+    np.testing.assert_array_equal(step_means(values, gap), rule)
+    np.testing.assert_array_equal(step_means(values[:4], gap[:4]), rule[:3])
