@@ -21,7 +21,7 @@ from vli_common.errors import InputError
 from vli_common.types import NANOSECONDS, Exposure, Image
 from vli_driver.bag import DEFAULT_IMAGE_TOPIC, BagReader, BagTopics
 
-_ENOUGH_FRAMES = 400
+_ENOUGH_FRAMES = 600
 _WIDEST_NS = NANOSECONDS // 10
 """Frames are thinned, evenly and at most to this distance, until there are enough: more only take longer."""
 _WORKERS = 4
