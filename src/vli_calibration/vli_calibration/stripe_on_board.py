@@ -29,6 +29,7 @@ _OPENING = 2.6
 """Length of the top-hat over the widest line: the foot of a line is some twice as wide as its half height."""
 _AVERAGED = 5
 """Profiles averaged along the stripe, pixels."""
+_OVEREXPOSED = 230
 _SMOOTHING = 12.0
 _MOST_SMOOTHING_PX = 5.0
 _MAX_LEAN = 0.1
@@ -145,7 +146,13 @@ class StripeFinder:
             max_lean=_MAX_LEAN,
             min_colour_ratio=_MIN_COLOUR_RATIO,
         )
-        return CentreOfMassDetector(config, self._band).detect(line_light(pixels, _OPENING * width_px, self.along_columns))
+        light = line_light(pixels, _OPENING * width_px, self.along_columns)
+        if pixels.ndim == 3 and self.channel in CHANNELS:
+            # The detector takes no colour from overexposed pixels; without their surroundings they no longer look it.
+            overexposed = pixels.min(axis=2) >= _OVEREXPOSED
+            for channel in set(range(3)) - {CHANNELS.index(self.channel)}:
+                light[overexposed, channel] = 255
+        return CentreOfMassDetector(config, self._band).detect(light)
 
     def _inside(self, pixels: FloatArray, surface: BoardSurface | None, margin_px: float) -> BoolArray:
         """Return which points lie on the surface, and not where the image's border cuts the line."""
