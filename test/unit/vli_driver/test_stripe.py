@@ -191,3 +191,15 @@ def test_real_images_of_the_wide_sensor_have_a_stripe_where_the_laser_is_on(shar
     counts = [len(detect(pixels)) for pixels in real_images(shared_data / "blaser_calibration/handheld_1280x720")]
     assert sum(count > 0 for count in counts[:17]) >= 15
     assert counts[17:] == [0] * 19
+
+
+def test_an_overexposed_line_is_white_in_its_core_and_keeps_the_colour_of_its_flanks() -> None:
+    centres = np.full(400, 80.0)
+    pixels = colour_image(Line(sigma=4.0, peak=240.0), centres, 2)
+    pixels[np.repeat(pixels[:, :, 2:] >= 200, 3, axis=2)] = 255
+    assert len(detect(pixels, config=StripeConfig(max_width_px=24.0, max_lean=0.1))) > 380
+
+
+def test_a_white_line_that_is_not_overexposed_is_still_no_laser() -> None:
+    grey = grey_image(Line(sigma=2.0, peak=120.0), np.full(400, 80.0))
+    assert len(detect(np.repeat(grey[:, :, None], 3, axis=2))) == 0
