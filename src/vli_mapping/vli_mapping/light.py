@@ -118,17 +118,22 @@ class LightEstimator:
         self._chunks: list[Sightings] = []
         self.spots = 0
         """Kept, of those that were offered."""
-        self._offered = 0
+        self._offered = self._lots = 0
         self._stride = 1
         self._fitted = 0
         self.latest = latest
         """As of the last fit."""
 
-    def add(self, sightings: Sightings) -> None:
-        """Take some spots; once there are enough, every second lot goes, so that they are spread over the whole scan."""
+    def is_due(self) -> bool:
+        """Count a lot that could be added; return False where it is to be left out."""
         self._offered += 1
-        if not len(sightings.spot) or self._offered % self._stride:
+        return self._offered % self._stride == 0
+
+    def add(self, sightings: Sightings) -> None:
+        """Take a lot of spots; once there are enough, every second lot goes, so that they are spread over the whole scan."""
+        if not len(sightings.spot):
             return
+        self._lots += 1
         self._chunks.append(sightings)
         self.spots += _count(sightings)
         if self.spots > _MAX_SPOTS:
@@ -138,8 +143,8 @@ class LightEstimator:
 
     def fit(self) -> Light | None:
         """Return the light by all spots so far, or None while these are too few."""
-        if self.spots >= MIN_SPOTS and self._offered != self._fitted:
-            self._fitted = self._offered
+        if self.spots >= MIN_SPOTS and self._lots != self._fitted:
+            self._fitted = self._lots
             self.latest = fit_light(_joined(self._chunks))
         return self.latest
 

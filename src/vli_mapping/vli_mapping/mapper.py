@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import deque
+
 import numpy as np
 
 from vli_common.arrays import FloatArray, IntArray
@@ -38,6 +40,8 @@ class Mapper:
         self._unrefined: list[tuple[IntArray, FloatArray]] = []
         self._light = LightEstimator()
         self._is_foreign = False
+        self._entering: deque[PosedScan] = deque()
+        self._touched: list[IntArray] = []
 
     def add_image(self, image: Image) -> None:
         """Take a long image, for colour."""
@@ -45,25 +49,37 @@ class Mapper:
             self._window.add_image(image)
 
     def add_scan(self, scan: LaserScan) -> None:
-        """Take the stripe of a short frame; it waits for its pose."""
+        """Take the stripe of a short frame; it waits for its pose. One that has its last pose enters the map.
+
+        As many scans leave the window at a keyframe as came since the last: so no frame has to enter them all.
+        """
         self._window.add_scan(scan)
+        self._enter_next()
 
     def add_window(self, window: WindowPoses) -> MappingOutput:
-        """Take the poses after a solve; return constraints for the next one, the newest stripes, and what is new in the map."""
+        """Take the poses after a solve; return constraints for the next one, the newest stripes, and what is new in the map.
+
+        The scans that leave the window enter with the scans that come, at the latest before the next window; at once where
+        nothing stays.
+        """
         session = window.session
         if session < self._window.session:
             self.counters.add("windows_of_old_session")
             return MappingOutput()
         if session > self._window.session:
             self.reset(session)
+        self.settle()
         self._window.update(window)
-        touched = self._enter_leaving()
+        self._let_go()
+        if window.final.all():
+            self.settle()
         constraints = None
         if self.constrains and not self._is_foreign:
             staying = self._window.staying()
             constraints = associate(self.map, staying, window.stamp_ns, self.config.association, self.counters, session)
         cloud = _live_cloud(self._window.unpublished(), window.stamp_ns, session)
         self._window.release(window)
+        touched = self._entered()
         update = (
             self.map.cloud(touched, window.stamp_ns, session, self._light.latest, self.config.colour == AS_SEEN)
             if len(touched)
@@ -73,6 +89,7 @@ class Mapper:
 
     def cloud(self, max_points: int | None = None, stamp_ns: int = 0, session: int = 0) -> PointCloud:
         """Return the map, thinned to ``max_points`` where given; colours as the config asks for."""
+        self.settle()
         light, as_seen = self.light(), self.config.colour == AS_SEEN
         if max_points is None:
             return self.map.cloud(None, stamp_ns, session, light, as_seen)
@@ -82,11 +99,18 @@ class Mapper:
         """Return the light on board and the lens as all scans so far tell of them; None while they tell too little."""
         return self._light.fit()
 
+    def settle(self) -> None:
+        """Enter all scans that have left the window."""
+        while self._entering:
+            self._enter_next()
+
     def adopt(self, snapshot: Snapshot) -> None:
         """Take a map of an earlier session in place of this one's.
 
         Poses of now and of then share no frame: until the next reset, no scan enters, and none is related to the map.
         """
+        self.settle()
+        self._touched.clear()
         self.map = restore(snapshot, self.config.map)
         self._light = LightEstimator(snapshot.light)
         self._unrefined.clear()
@@ -98,6 +122,8 @@ class Mapper:
         The old map stays intact for whoever holds it.
         """
         self.counters.add("sessions")
+        self.settle()
+        self._touched.clear()
         self._is_foreign = False
         if len(self.map):
             self.map = PointMap(self.config.map)
@@ -105,14 +131,26 @@ class Mapper:
         self._light = LightEstimator()
         self._window = self._window.successor(session)
 
-    def _enter_leaving(self) -> IntArray:
-        """Enter the scans that leave the window; return the map points they became or joined, ascending."""
+    def _let_go(self) -> None:
+        """Line up the scans that leave the window, and learn what they tell of the light."""
+        leaving = list(self._window.leaving())
         if self._is_foreign:
-            self.counters.add("scans_beside_a_loaded_map", sum(1 for _ in self._window.leaving()))
-            return np.empty(0, np.int64)
-        self._light.add(self._window.sightings())
-        touched = [np.empty(0, np.int64), *(self._enter(item) for item in self._window.leaving())]
-        return self.map.alive(np.unique(np.concatenate(touched)))
+            self.counters.add("scans_beside_a_loaded_map", len(leaving))
+            return
+        if self._light.is_due():
+            self._light.add(self._window.sightings())
+        self._entering.extend(leaving)
+
+    def _enter_next(self) -> None:
+        """Enter the oldest scan that waits, if one does."""
+        if self._entering:
+            self._touched.append(self._enter(self._entering.popleft()))
+
+    def _entered(self) -> IntArray:
+        """Return the map points that scans became or joined since the last call, ascending."""
+        touched = self.map.alive(np.unique(np.concatenate([np.empty(0, np.int64), *self._touched])))
+        self._touched.clear()
+        return touched
 
     def _enter(self, item: PosedScan) -> IntArray:
         """Merge one scan into the map; return the map points (K,) it touched."""

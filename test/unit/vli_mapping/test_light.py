@@ -156,6 +156,8 @@ def test_the_number_of_spots_is_bounded_and_their_fit_repeatable() -> None:
         for _ in range(200):
             points = np.repeat(rng_lot.uniform([-0.01, -0.01, 0.03], [0.01, 0.01, 0.04], (50, 3)), 2, axis=0)
             level = rng_lot.uniform(50, 60, 100)
+            if not estimator.is_due():
+                continue
             estimator.add(Sightings(np.repeat(np.arange(50), 2), level, points, np.tile([0.0, 0.0, -1.0], (100, 1))))
         return estimator
 

@@ -227,3 +227,37 @@ def test_two_runs_give_the_same_bytes() -> None:
     assert clouds[0].normals is not None
     assert clouds[1].normals is not None
     assert clouds[0].normals.tobytes() == clouds[1].normals.tobytes()
+
+
+def partly_final(mapper: Mapper, first: int, last: int, final_before: int) -> None:
+    """Give a window of frames [first, last) of which those before ``final_before`` leave."""
+    stamps = [index * FRAME_NS for index in range(first, last)]
+    kinds = [FrameKind.SHORT if index % 2 else FrameKind.LONG for index in range(first, last)]
+    whole = window(stamps, kinds, [pose_at(index) for index in range(first, last)])
+    mapper.add_window(replace(whole, final=np.arange(first, last) < final_before))
+
+
+def test_scans_that_leave_enter_one_by_one_with_those_that_come() -> None:
+    mapper = Mapper(calibration())
+    feed(mapper, 0, 41)
+    partly_final(mapper, 0, 41, 20)
+    assert mapper.counters["scans_entered"] == 0
+    feed(mapper, 41, 47)
+    assert mapper.counters["scans_entered"] == 3
+    partly_final(mapper, 20, 47, 20)
+    assert mapper.counters["scans_entered"] == 10
+
+
+def test_the_map_does_not_depend_on_when_scans_enter() -> None:
+    clouds = []
+    for eager in (True, False):
+        mapper = Mapper(calibration())
+        for first in range(0, 120, 20):
+            feed(mapper, first, first + 20)
+            partly_final(mapper, max(first - 20, 0), first + 20, first)
+            if eager:
+                mapper.settle()
+        clouds.append(mapper.cloud())
+    np.testing.assert_array_equal(clouds[0].points, clouds[1].points)
+    np.testing.assert_array_equal(clouds[0].colours, clouds[1].colours)
+    assert len(clouds[0]) > 1000

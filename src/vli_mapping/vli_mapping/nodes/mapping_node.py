@@ -27,6 +27,7 @@ from vli_common.topics import CLOUD, IMAGE_LONG, LASER_POINTS, MAP, MAP_CONSTRAI
 from vli_common.types import Counters, Image, LaserScan, PointCloud, WindowPoses
 from vli_mapping.config import AS_SEEN, MappingConfig
 from vli_mapping.export import write_cloud
+from vli_mapping.light import Light
 from vli_mapping.map_file import SUFFIX, load_map, save_map
 from vli_mapping.mapper import Mapper
 from vli_mapping.mesh import make_mesh, write_mesh
@@ -180,11 +181,15 @@ class MappingNode(VliNode):
         return len(snapshot)
 
     def _snapshot(self, path: Path) -> Snapshot:
-        light = self.call(lambda: self.mapper.light())
+        light = self.call(self._settled_light)
         snapshot = take(self.mapper.map, light, self.call)
         if not len(snapshot):
             raise OutputError(f"the map is empty, '{path}' is not written")
         return snapshot
+
+    def _settled_light(self) -> Light | None:
+        self.mapper.settle()
+        return self.mapper.light()
 
     def _cloud(self, path: Path) -> PointCloud:
         as_seen = self.parameters.config(MappingConfig).colour == AS_SEEN
