@@ -47,10 +47,12 @@ def prepare(work: Path) -> None:
 
 
 def set_apart(pairs: Path, others: Path) -> None:
-    """Move the last of the pairs to where the calibration does not see them, for the check."""
+    """Move every fourth pair to where the calibration does not see it, for the check: the simulator goes from near to far."""
     others.mkdir()
-    for file in sorted(pairs.glob("*.png"))[60:]:
-        file.rename(others / file.name)
+    for index, long in enumerate(sorted(pairs.glob("*_long.png"))):
+        if index % 4 == 3:
+            for file in (long, long.with_name(long.name.replace("_long", "_short"))):
+                file.rename(others / file.name)
 
 
 def draw(out: Path, work: Path) -> None:
