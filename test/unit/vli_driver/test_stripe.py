@@ -197,7 +197,7 @@ def test_an_overexposed_line_is_white_in_its_core_and_keeps_the_colour_of_its_fl
     centres = np.full(400, 80.0)
     pixels = colour_image(Line(sigma=4.0, peak=240.0), centres, 2)
     pixels[np.repeat(pixels[:, :, 2:] >= 200, 3, axis=2)] = 255
-    assert len(detect(pixels, config=StripeConfig(max_width_px=24.0, max_lean=0.1))) > 380
+    assert len(detect(pixels, config=StripeConfig(channel="red", max_width_px=24.0, max_lean=0.1))) > 380
 
 
 def test_a_white_line_that_is_not_overexposed_is_still_no_laser() -> None:
