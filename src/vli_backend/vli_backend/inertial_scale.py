@@ -40,20 +40,22 @@ class InertialScale:
     def clear(self) -> None:
         """Begin a new piece."""
         self._keyframes: list[FloatArray] = []
+        self._keyframe_ns = 0
         self._between: list[list[tuple[FloatArray, FrontEndOutput]]] = []
 
     def add_frame(self, frame: FrontEndOutput, estimate: PoseEstimate) -> tuple[float, float] | None:
         """Take a frame and its live pose; at the end of a piece return scale and relative sigma."""
         T_odom_imu = inverse(estimate.T_map_odom) @ estimate.T_map_imu
         seen = pose(T_odom_imu[:3, :3], (T_odom_imu @ self._T_imu_cam)[:3, 3])
-        if frame.tracks.stationary or (frame.preintegration is None and self._keyframes):
+        follows = frame.preintegration is not None and frame.preintegration.from_ns == self._keyframe_ns
+        if frame.tracks.stationary or (self._keyframes and not follows):
             self.clear()
-            return None
         if self._between:
             self._between[-1].append((seen, frame))
         if not frame.tracks.keyframe:
             return None
         self._keyframes.append(seen)
+        self._keyframe_ns = frame.tracks.stamp_ns
         self._between.append([])
         if len(self._keyframes) < _KEYFRAMES:
             return None

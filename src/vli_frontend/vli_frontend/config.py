@@ -132,7 +132,7 @@ class TimeShiftConfig:
 
     online: bool = parameter(True, doc="correct a time shift that is certainly wrong; false: that of the calibration stays")
     memory_s: float = parameter(
-        10.0, unit="s", minimum=1.0, maximum=600.0, doc="how long a pair of frames counts; longer: surer, corrects later"
+        10.0, unit="s", minimum=4.0, maximum=600.0, doc="how long a pair of frames counts; longer: surer, corrects later"
     )
     least_s: float = parameter(
         4.0e-4,

@@ -176,3 +176,11 @@ def test_a_failing_solver_costs_the_window_not_the_scan(failures: int, monkeypat
     assert back_end.counters["lost"] == failures - 1
     assert outputs[-1].state is TrackingState.TRACKING
     assert any("indeterminate linear system" in o.reason for o in outputs)
+
+
+@pytest.mark.slow
+def test_a_scanner_at_rest_does_not_drift() -> None:
+    _, outputs = _run(lambda frame, t: frame, 24.0, Scan(Motion(rest_s=1e6), pixel_noise=0.2))
+    positions = np.stack([o.pose.T_map_imu[:3, 3] for o in outputs if o.pose is not None])
+    end = positions[-60:].mean(axis=0) - positions[:60].mean(axis=0)
+    assert np.linalg.norm(end) < 1e-5

@@ -12,8 +12,8 @@ from planar_scene import CAMERA, LONG_NS, START_NS, T_CAM_IMU, PlanarScene, cali
 from vli_common.arrays import FloatArray
 from vli_common.errors import CalibrationError
 from vli_common.geometry import so3_log
-from vli_common.types import FrontEndOutput, Image, ImuBias, ImuSample, LaserScan, Mode, TrackFlag
-from vli_frontend.config import FrontEndConfig, KltConfig
+from vli_common.types import FrontEndOutput, Image, ImuBias, ImuSample, LaserScan, Mode, PoseEstimate, TrackFlag
+from vli_frontend.config import FrontEndConfig, KltConfig, TimeShiftConfig
 from vli_frontend.frontend import FrontEnd
 
 Items = list[Image | ImuSample]
@@ -166,6 +166,43 @@ def test_a_gyro_bias_once_known_is_taken_out_of_the_prediction() -> None:
     outputs = feed(front_end, list(PlanarScene(rest_s=0.5, gyro_bias=bias).items(10)))
     assert all(o.tracks.stationary for o in outputs)
     assert not any(o.tracks.stationary for o in feed(make(), list(PlanarScene(rest_s=0.5, gyro_bias=bias).items(10))))
+
+
+@pytest.fixture(scope="module")
+def longer(scene: PlanarScene) -> Items:
+    return list(scene.items(2 * FRAMES))
+
+
+def live_pose(scene: PlanarScene, stamp_ns: int, session: int = 0) -> PoseEstimate:
+    T = scene.camera(stamp_ns) @ T_CAM_IMU
+    return PoseEstimate(stamp_ns, T, np.eye(4), np.zeros(3), np.zeros(3), np.eye(6), session)
+
+
+def run_with_poses(items: Items, scene: PlanarScene, timeshift_ns: int, session: int = 0) -> FrontEnd:
+    shift = TimeShiftConfig(memory_s=4.0)
+    front_end = FrontEnd(calibration(timeshift_ns), replace(CONFIG, time_shift=shift), Mode.VLI_SLAM)
+    for item in items:
+        for output in feed(front_end, [item])[: item.stamp_ns > START_NS + 3 * LONG_NS]:
+            # The scene starts with a jerk, which no IMU sees at 200 Hz.
+            front_end.add_pose(live_pose(scene, output.tracks.stamp_ns, session))
+    return front_end
+
+
+def test_poses_tell_a_wrong_time_shift_which_is_corrected_and_said(longer: Items, scene: PlanarScene) -> None:
+    front_end = run_with_poses(longer, scene, 8_000_000)
+    assert abs(front_end.timeshift_ns) < 1_500_000
+    assert "set cam0.timeshift_cam_imu to" in front_end.hint
+    assert front_end.counters["time_shift_corrections"] >= 1
+
+
+def test_a_right_time_shift_stays_and_nothing_is_said(longer: Items, scene: PlanarScene) -> None:
+    front_end = run_with_poses(longer, scene, 0)
+    assert front_end.timeshift_ns == 0
+    assert front_end.hint == ""
+
+
+def test_poses_of_another_session_tell_nothing(items: Items, scene: PlanarScene) -> None:
+    assert run_with_poses(items, scene, 8_000_000, session=4).timeshift_ns == 8_000_000
 
 
 def test_two_runs_are_identical_also_after_a_reset(items: Items, outputs: list[FrontEndOutput]) -> None:
