@@ -273,7 +273,7 @@ class _Block:
     def pose_step(self, shared: FloatArray, damping: float) -> FloatArray:
         """Return the step (6,) of the pose that goes with a step of the shared parameters."""
         right: FloatArray = self.gradient[-6:] + self.hessian[-6:, :-6] @ shared
-        step: FloatArray = np.linalg.solve(_damped(self.hessian[-6:, -6:], damping), -right)
+        step: FloatArray = np.asarray(np.linalg.solve(_damped(self.hessian[-6:, -6:], damping), -right), np.float64)
         return step
 
 
