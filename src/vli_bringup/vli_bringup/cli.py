@@ -21,6 +21,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "calibrate": ("vli_calibration.cli", "camera, laser plane, IMU: make a calibration and say what it is worth"),
     "doctor": ("vli_bringup.doctor", "is a bag, or a live sensor, fit for a scan? say what to change"),
     "export": ("vli_bringup.export", "a map to a cloud (.ply .pcd .las .laz .e57) or a mesh (.stl .obj .glb, .ply with --mesh)"),
+    "merge": ("vli_bringup.merge", "several saved maps that overlap, aligned, to one"),
     "eval": ("vli_bringup.evaluation", "compare the output of run or replay with the truth"),
 }
 """Name → module with ``add_arguments(parser)`` and ``run(args) -> int``, and the line in ``vli --help``."""

@@ -170,6 +170,13 @@ class PointMap:
         )
         return target
 
+    def add_weight(self, target: IntArray, more: Float32Array) -> None:
+        """Let points count for ``more`` (N,) than one; ``target`` (N,) is what ``insert`` said of them."""
+        there = target >= 0
+        weight = self.columns.weight
+        np.add.at(weight, target[there], more[there])
+        np.minimum(weight, np.float32(self.config.max_weight), out=weight, where=weight > 0)
+
     def refine_normals(self, which: IntArray, viewpoint: FloatArray) -> None:
         """Fit the normals of rows ``which`` (K,) again, to all that is near by now; new ones face ``viewpoint`` (3,)."""
         c, config = self.columns, self.config

@@ -20,13 +20,14 @@ def thin(points: FloatArray, weights: Float32Array, max_points: int) -> IntArray
         max_points: the voxel's edge grows from the smallest one until so few remain.
     """
     edge = SMALLEST_VOXEL_M
-    while len(kept := _heaviest(points, weights, edge)) > max_points:
+    while len(kept := thin_to_voxel(points, weights, edge)) > max_points:
         # Points lie on surfaces: their number falls with the square of the edge; never by less than a little.
         edge *= max(1.02, 0.98 * (len(kept) / max_points) ** 0.5)
     return kept
 
 
-def _heaviest(points: FloatArray, weights: Float32Array, edge: float) -> IntArray:
+def thin_to_voxel(points: FloatArray, weights: Float32Array, edge: float) -> IntArray:
+    """Return indices (K,), ascending: of each voxel of ``edge`` metres the heaviest of points (N, 3), the first of equals."""
     heads = SpatialHash(edge, len(points))
     kept = np.zeros(len(points), np.bool_)
     _mark_heaviest(heads.heads, heads.next, points, weights, edge, kept)

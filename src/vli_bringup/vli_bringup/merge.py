@@ -1,0 +1,45 @@
+"""``vli merge``: several saved maps that overlap to one."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from vli_common.errors import InputError, OutputError
+from vli_mapping.map_file import SUFFIX, load_map, save_map
+from vli_mapping.merging import merge_maps
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of ``vli merge``."""
+    parser.add_argument(
+        "maps", metavar="MAP", type=Path, nargs="+", help=f"results of 'vli run', or {SUFFIX} files; the first is the frame"
+    )
+    parser.add_argument("--out", metavar="MAP", type=Path, required=True, help=f"file to write ({SUFFIX}), for 'vli export'")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Align and join; return 0.
+
+    Raises:
+        VliError: a map cannot be read, or does not overlap with those before it, or the result cannot be written.
+    """
+    if len(args.maps) < 2:
+        raise InputError(f"'{args.maps[0]}' is one map, expected two or more to merge")
+    if args.out.suffix != SUFFIX:
+        raise OutputError(
+            f"'{args.out}' ends in '{args.out.suffix}', expected '{SUFFIX}'; 'vli export' makes other formats of it"
+        )
+    snapshots = []
+    for path in args.maps:
+        snapshots.append(load_map(path / f"map{SUFFIX}" if path.is_dir() else path))
+        if not len(snapshots[-1]):
+            raise InputError(f"map '{path}' is empty, there is nothing to merge")
+    merged, registrations = merge_maps(snapshots)
+    save_map(args.out, merged)
+    for path, found in zip(args.maps[1:], registrations, strict=True):
+        shared = f"{100 * found.agreeing:.0f} % of the overlap alike, {1e3 * found.rms_m:.3f} mm RMS point to plane"
+        sys.stdout.write(f"'{path}': {shared}\n")
+    sys.stdout.write(f"{len(merged)} points in '{args.out}'\n")
+    return 0

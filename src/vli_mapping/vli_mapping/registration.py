@@ -1,0 +1,245 @@
+"""How one map lies in another: coarsely by the shape around their points, finely by point-to-plane ICP.
+
+Both maps are levelled by gravity, so that four unknowns are left for the coarse part: heading and place. A pair of matched points
+gives them; matches come from fast point feature histograms (Rusu et al., "Fast point feature histograms (FPFH) for 3D
+registration", 2009) with the colour beside them. Things repeat (a keyboard's keys every 19 mm): of several candidates the one in
+which most of the overlap agrees in place, normal and colour wins, and only by a margin.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from vli_common.arrays import Float32Array, FloatArray, IntArray
+from vli_common.errors import InputError
+from vli_common.geometry import inverse, pose, so3_exp, transform
+from vli_mapping.thinning import thin_to_voxel
+
+if TYPE_CHECKING:
+    from scipy.spatial import KDTree
+
+ICP_VOXEL_M = 5e-4
+"""Of the surfaces that are compared: a point each, so that dense parts do not outweigh the rest."""
+_KEYPOINT_M, _SHAPE_M = 1.5e-3, 5e-3
+_BINS = 11
+_COLOUR_WEIGHT = 1.0
+"""Of a colour's distance, full scale, against that of the histograms."""
+_TRIES = 4000
+_LOOSE_M, _TIGHT_M = 1.5e-3, 3e-4
+_CANDIDATES = 5
+_DISTINCT_M = 3e-3
+_MARGIN = 1.15
+_MIN_SHARE = 0.5
+_MIN_OVERLAP = 200
+_ICP_STEPS = 30
+_MAX_ANGLE_COSINE = 0.7
+_MAX_COLOUR = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class Surface:
+    """Points (N, 3) with unit normals (N, 3) and colours (N, 3), one a voxel."""
+
+    points: FloatArray
+    normals: FloatArray
+    colours: Float32Array
+
+
+@dataclass(frozen=True, slots=True)
+class Registration:
+    """How a source lies in a target.
+
+    Args:
+        T_target_source: (4, 4).
+        rms_m: of the point-to-plane distances of the overlap.
+        overlap: points of the source that the target has too.
+        agreeing: share of these that agree in normal and colour.
+    """
+
+    T_target_source: FloatArray
+    rms_m: float
+    overlap: int
+    agreeing: float
+
+    @property
+    def score(self) -> float:
+        """Agreeing points."""
+        return self.overlap * self.agreeing**2
+
+
+def register(target: Surface, source: Surface, seed: int = 0) -> Registration:
+    """Return how ``source`` lies in ``target``.
+
+    Args:
+        target, source: in frames that are levelled and metric, and share a part.
+        seed: of the random choices.
+
+    Raises:
+        InputError: they share too little, or could lie in each other in more than one way.
+    """
+    found = [refine(target, source, T) for T in [np.eye(4), *_candidates(target, source, np.random.default_rng(seed))]]
+    found.sort(key=lambda item: -item.score)
+    best = found[0]
+    if best.overlap < _MIN_OVERLAP or best.agreeing < _MIN_SHARE:
+        raise InputError(
+            f"maps share only '{best.overlap}' points '{100 * best.agreeing:.0f}' % alike, one a {1e3 * ICP_VOXEL_M:g} mm voxel, "
+            f"expected {_MIN_OVERLAP} and {100 * _MIN_SHARE:.0f} %; scan more of what both have"
+        )
+    centre = source.points.mean(axis=0)
+    for other in found[1:]:
+        apart = np.linalg.norm(transform(other.T_target_source @ inverse(best.T_target_source), centre[None]) - centre)
+        if apart > _DISTINCT_M and other.score * _MARGIN > best.score:
+            raise InputError(
+                f"maps fit into each other in two ways '{1e3 * apart:.0f}' mm apart, expected one; scan more of what both have"
+            )
+    return best
+
+
+def refine(target: Surface, source: Surface, T_target_source: FloatArray) -> Registration:
+    """Return the nearest registration by point-to-plane ICP whose gate closes from 1.5 to 0.3 mm."""
+    from scipy.spatial import KDTree
+
+    tree = KDTree(target.points)
+    T = T_target_source
+    for step in range(_ICP_STEPS):
+        gate = max(_LOOSE_M * 0.85**step, _TIGHT_M)
+        points, normals = transform(T, source.points), source.normals @ T[:3, :3].T
+        which, at = _pairs(tree, target, points, normals, gate)
+        if len(which) < 6:
+            break
+        T = _step(points[which], target.points[at], target.normals[at]) @ T
+    points, normals = transform(T, source.points), source.normals @ T[:3, :3].T
+    distance, nearest = _nearest(tree, points, 2 * _TIGHT_M)
+    near = np.flatnonzero(np.isfinite(distance))
+    at = nearest[near]
+    if not len(near):
+        return Registration(T, 0.0, 0, 0.0)
+    off = np.einsum("ni,ni->n", points[near] - target.points[at], target.normals[at])
+    alike = np.einsum("ni,ni->n", normals[near], target.normals[at]) > _MAX_ANGLE_COSINE
+    alike &= ~(np.abs(source.colours[near] - target.colours[at]).max(axis=1) > _MAX_COLOUR)
+    return Registration(T, float(np.sqrt((off**2).mean())), len(near), float(alike.mean()))
+
+
+def surface_of(points: FloatArray, normals: Float32Array, colours: Float32Array, weights: Float32Array, edge: float) -> Surface:
+    """Return the heaviest point with a normal of each voxel of ``edge`` metres."""
+    flat = np.flatnonzero(normals.any(axis=1))
+    which = flat[thin_to_voxel(points[flat], weights[flat], edge)]
+    return Surface(points[which], normals[which].astype(np.float64), colours[which])
+
+
+def _nearest(tree: KDTree, points: FloatArray, reach: float = np.inf) -> tuple[FloatArray, IntArray]:
+    """Return distance and index (N,) of the nearest point of a tree; infinite, and past the end, beyond ``reach``."""
+    distance, index = tree.query(points, distance_upper_bound=reach)
+    return np.asarray(distance, np.float64), np.asarray(index, np.int64)
+
+
+def _pairs(tree: KDTree, target: Surface, points: FloatArray, normals: FloatArray, gate: float) -> tuple[IntArray, IntArray]:
+    """Return which points have a target point within ``gate`` with a like normal, and which that is."""
+    distance, nearest = _nearest(tree, points, gate)
+    which = np.flatnonzero(np.isfinite(distance))
+    like = np.einsum("ni,ni->n", normals[which], target.normals[nearest[which]]) > _MAX_ANGLE_COSINE
+    return which[like], nearest[which[like]]
+
+
+def _step(points: FloatArray, targets: FloatArray, normals: FloatArray) -> FloatArray:
+    """Return the small motion (4, 4) that brings points (N, 3) nearest to the planes; directions no plane tells of stay."""
+    centre = points.mean(axis=0)
+    jacobian = np.concatenate([np.cross(points - centre, normals), normals], axis=1)
+    residual = np.einsum("ni,ni->n", targets - points, normals)
+    # In metres and in radians at the edge of the overlap: one scale for the cut-off.
+    size = float(np.linalg.norm(points - centre, axis=1).max()) or 1.0
+    scale = np.array([1 / size] * 3 + [1.0] * 3)
+    solution = scale * np.linalg.lstsq(jacobian * scale, residual, rcond=1e-3)[0]
+    motion = pose(so3_exp(solution[:3]), np.zeros(3))
+    motion[:3, 3] = centre - motion[:3, :3] @ centre + solution[3:]
+    return motion
+
+
+def _candidates(target: Surface, source: Surface, rng: np.random.Generator) -> list[FloatArray]:
+    """Return up to five distinct transforms with the most matches of features in place, best first."""
+    a, b = _keypoints(source), _keypoints(target)
+    first, second = _matches(describe(a), describe(b))
+    p, q = a.points[first], b.points[second]
+    if len(p) < 2:
+        return []
+    i, j = rng.integers(len(p), size=(2, _TRIES))
+    along_p, along_q = p[j] - p[i], q[j] - q[i]
+    length = np.hypot(along_p[:, 0], along_p[:, 1])
+    possible = (length > _SHAPE_M) & (np.abs(along_p[:, 2] - along_q[:, 2]) < _LOOSE_M)
+    possible &= np.abs(length - np.hypot(along_q[:, 0], along_q[:, 1])) < _LOOSE_M
+    heading = np.arctan2(along_q[:, 1], along_q[:, 0]) - np.arctan2(along_p[:, 1], along_p[:, 0])
+    ranked: list[tuple[int, FloatArray]] = []
+    for k in np.flatnonzero(possible):
+        T = pose(so3_exp(np.array([0.0, 0.0, heading[k]])), np.zeros(3))
+        T[:3, 3] = (q[i[k]] + q[j[k]]) / 2 - T[:3, :3] @ ((p[i[k]] + p[j[k]]) / 2)
+        ranked.append((int((((transform(T, p) - q) ** 2).sum(axis=1) < _LOOSE_M**2).sum()), T))
+    ranked.sort(key=lambda item: -item[0])
+    return _distinct([T for _, T in ranked], p.mean(axis=0))
+
+
+def _distinct(transforms: list[FloatArray], centre: FloatArray) -> list[FloatArray]:
+    kept: list[FloatArray] = []
+    for T in transforms:
+        place = transform(T, centre[None])
+        if all(np.linalg.norm(transform(other, centre[None]) - place) > _DISTINCT_M for other in kept):
+            kept.append(T)
+        if len(kept) == _CANDIDATES:
+            break
+    return kept
+
+
+def _keypoints(surface: Surface) -> Surface:
+    which = thin_to_voxel(surface.points, np.ones(len(surface.points), np.float32), _KEYPOINT_M)
+    return Surface(surface.points[which], surface.normals[which], surface.colours[which])
+
+
+def _matches(a: FloatArray, b: FloatArray) -> tuple[IntArray, IntArray]:
+    """Return the pairs of rows that are nearest to each other."""
+    from scipy.spatial import KDTree
+
+    if not len(a) or not len(b):
+        return np.empty(0, np.int64), np.empty(0, np.int64)
+    to_b, to_a = _nearest(KDTree(b), a)[1], _nearest(KDTree(a), b)[1]
+    first = np.flatnonzero(to_a[to_b] == np.arange(len(a)))
+    return first, to_b[first]
+
+
+def describe(surface: Surface) -> FloatArray:
+    """Return (N, 39): the FPFH of the points within 5 mm around each (33), their mean colour (3) and its spread (3)."""
+    from scipy.spatial import KDTree
+
+    count = len(surface.points)
+    pairs = KDTree(surface.points).query_pairs(_SHAPE_M, output_type="ndarray")
+    i, j = np.concatenate([pairs, pairs[:, ::-1]]).T
+    simple = np.zeros((count, 3 * _BINS))
+    for feature, value in enumerate(_angles(surface, i, j)):
+        column = np.clip((value * _BINS).astype(np.int64), 0, _BINS - 1) + feature * _BINS
+        np.add.at(simple, (i, column), 1.0)
+    neighbours = np.maximum(np.bincount(i, minlength=count), 1)[:, None]
+    simple /= neighbours
+    near = 1.0 / (1.0 + np.linalg.norm(surface.points[i] - surface.points[j], axis=1) / _KEYPOINT_M)
+    full = simple.copy()
+    np.add.at(full, i, simple[j] * near[:, None] / neighbours[i])
+    full /= np.maximum(np.linalg.norm(full, axis=1, keepdims=True), 1e-9)
+    mean, square = np.zeros((count, 3)), np.zeros((count, 3))
+    np.add.at(mean, i, surface.colours[j] / 255)
+    np.add.at(square, i, (surface.colours[j] / 255) ** 2)
+    mean /= neighbours
+    spread = np.sqrt(np.maximum(square / neighbours - mean**2, 0.0))
+    return np.concatenate([full, _COLOUR_WEIGHT * mean, _COLOUR_WEIGHT * spread], axis=1)
+
+
+def _angles(surface: Surface, i: IntArray, j: IntArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the three angles of each pair in the frame of Darboux, each scaled to [0, 1]."""
+    u, n = surface.normals[i], surface.normals[j]
+    d = surface.points[j] - surface.points[i]
+    d /= np.linalg.norm(d, axis=1, keepdims=True)
+    v = np.cross(u, d)
+    v /= np.maximum(np.linalg.norm(v, axis=1, keepdims=True), 1e-9)
+    w = np.cross(u, v)
+    alpha, phi = np.einsum("ni,ni->n", v, n), np.einsum("ni,ni->n", u, d)
+    theta = np.arctan2(np.einsum("ni,ni->n", w, n), np.einsum("ni,ni->n", u, n))
+    return (alpha + 1) / 2, (phi + 1) / 2, (theta / np.pi + 1) / 2
