@@ -7,6 +7,7 @@ import numpy as np
 
 from vli_common.arrays import FloatArray
 from vli_common.calibration import ImuCalibration
+from vli_common.geometry import so3_exp
 from vli_common.types import Counters, ImuBias, Preintegration
 from vli_frontend.config import ImuConfig
 from vli_frontend.imu_noise import NoiseMonitor
@@ -98,10 +99,28 @@ class Preintegrator:
         params = self._params if inflate == 1.0 else combined_params(self._noise.imu, self._config, inflate)
         measurements = gtsam.PreintegratedCombinedMeasurements(params, self._interval_bias)
         stamps_s = (segment.stamps - segment.stamps[0]) * 1e-9
-        accel, gyro = step_means(segment.accel, stamps_s), step_means(segment.gyro, stamps_s)
-        for a, w, dt in zip(accel, gyro, np.diff(stamps_s).tolist(), strict=True):
+        steps = np.diff(stamps_s)
+        gyro = step_means(segment.gyro, stamps_s)
+        accel = force_at_start(step_means(segment.accel, stamps_s), gyro, steps, self._interval_bias)
+        for a, w, dt in zip(accel, gyro, steps.tolist(), strict=True):
             measurements.integrateMeasurement(a, w, dt)
         return measurements
+
+
+def force_at_start(accel: FloatArray, gyro: FloatArray, steps: FloatArray, bias: gtsam.imuBias.ConstantBias) -> FloatArray:
+    """Return the mean force (N, 3) of each step as seen in the attitude at its start, with the bias as it was.
+
+    GTSAM turns the force of a step by that attitude, while the mean is that of the middle: taken as it is, gravity would lag the
+    rotation by half a sample.
+
+    Args:
+        accel, gyro: (N, 3) means over the steps, bias included.
+        steps: (N,) seconds.
+        bias: that the preintegration subtracts.
+    """
+    half_turns = so3_exp(0.5 * steps[:, None] * (gyro - bias.gyroscope()))
+    force: FloatArray = np.einsum("nij,nj->ni", half_turns, accel - bias.accelerometer())
+    return force + bias.accelerometer()
 
 
 def step_means(values: FloatArray, stamps_s: FloatArray) -> FloatArray:

@@ -57,6 +57,18 @@ def test_a_ramp_is_integrated_exactly_by_midpoints_also_in_the_partial_steps() -
     np.testing.assert_allclose(measurements(rig.measure(13, 213)).deltaRij().matrix(), so3_exp(direction * angle), atol=1e-9)
 
 
+def test_gravity_does_not_lag_the_rotation() -> None:
+    """An IMU that turns on the spot measures gravity from ever new sides; seen from where it began, that is one direction."""
+    rig, gravity = Rig([]), np.array([0.0, 0.0, 9.81])
+    for k in range(60):
+        turned = so3_exp(RATE * 0.005 * k).T @ gravity
+        rig.preintegrator._synchroniser.add_imu(ImuSample(k * 5 * MS, RATE, turned))
+    pim = measurements(rig.measure(10, 210))
+    begin = so3_exp(RATE * 0.010).T @ gravity
+    np.testing.assert_allclose(pim.deltaVij(), 0.2 * begin, atol=2e-5)
+    np.testing.assert_allclose(pim.deltaPij(), 0.5 * 0.2**2 * begin, atol=2e-6)
+
+
 def test_without_rotation_position_and_velocity_are_those_of_constant_force() -> None:
     rig = Rig([])
     for k in range(60):
