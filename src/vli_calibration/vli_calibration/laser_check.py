@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vli_calibration.board_surface import BoardSurface
 from vli_calibration.boards import Target
 from vli_calibration.laser_model import LaserPlane, stripe_points
 from vli_calibration.laser_scenes import LaserScene, look_at, rejections, require_boards, require_stripes
@@ -14,8 +15,14 @@ from vli_calibration.laser_table import triangulated
 from vli_calibration.types import CalibrationImage, Rejection
 from vli_common.arrays import FloatArray
 from vli_common.camera import CameraModel
+from vli_common.errors import InputError
 
 LEAST_CHECKED = 1
+_LEAST_POINTS = 10
+_MAD_SIGMA = 1.4826
+"""Standard deviation over median absolute deviation, of Gaussian errors; neighbours err together: none is averaged away."""
+_OTHER_SURFACE_SIGMAS = 3.0
+_BESIDE = "too little of the stripe is seen on the print; what is beside it may be another surface"
 
 
 @dataclass(frozen=True)
@@ -77,23 +84,43 @@ class LaserCheck:
 def check_laser(images: Sequence[CalibrationImage], target: Target, camera: CameraModel, plane: LaserPlane) -> LaserCheck:
     """Triangulate the stripe of every image, eq. (1), and compare with the board's pose from its corners.
 
+    What lies on the print decides: beside it the stripe may be on a table below the board, and speak against a good plane.
+
     Raises:
         InputError: no board, or no stripe on one, in any image.
     """
     scenes, _ = look_at(images, target, camera)
     require_boards(scenes, target)
     require_stripes(scenes, LEAST_CHECKED)
-    checked = tuple(image for scene in scenes if (image := _checked(scene, camera, plane)) is not None)
-    return LaserCheck(checked, tuple(rejections(scenes)), tuple(scenes))
+    checked = tuple(image for scene in scenes if (image := _checked(scene, target, camera, plane)) is not None)
+    if not checked:
+        raise InputError(
+            f"in none of {len(scenes)} images the stripe crosses the print of the board; let it, and take new images"
+        )
+    names = {image.name for image in checked}
+    beside = [Rejection(scene.name, _BESIDE) for scene in scenes if scene.has_both and scene.name not in names]
+    return LaserCheck(checked, (*rejections(scenes), *beside), tuple(scenes))
 
 
-def _checked(scene: LaserScene, camera: CameraModel, plane: LaserPlane) -> CheckedImage | None:
+def _checked(scene: LaserScene, target: Target, camera: CameraModel, plane: LaserPlane) -> CheckedImage | None:
     if scene.board is None or scene.stripe is None:
         return None
     pixels = scene.stripe.pixels[scene.stripe.kept]
+    on_print = BoardSurface(camera, scene.board.T_cam_board, target).on_print(pixels)
+    if on_print.sum() < _LEAST_POINTS:
+        return None
     points = triangulated(camera, plane, pixels)
     errors = points[:, 2] - stripe_points(camera, scene.board.T_cam_board, pixels)[:, 2]
+    if _differ(errors[on_print], errors[~on_print]):
+        points, errors = points[on_print], errors[on_print]
     return CheckedImage(scene.name, points[:, 2], errors, _flatness(points, scene.board.T_cam_board))
+
+
+def _differ(board: FloatArray, beside: FloatArray) -> bool:
+    """Return True where errors beside the print (N,) are another surface's: their median is far off that on the print (M,)."""
+    middle = float(np.median(board))
+    sigma = _MAD_SIGMA * float(np.median(np.abs(board - middle)))
+    return len(beside) > 0 and abs(float(np.median(beside)) - middle) > _OTHER_SURFACE_SIGMAS * sigma
 
 
 def _flatness(points: FloatArray, T_cam_board: FloatArray) -> FloatArray:
