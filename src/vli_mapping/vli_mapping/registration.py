@@ -32,11 +32,14 @@ _LOOSE_M, _TIGHT_M = 1.5e-3, 3e-4
 _CANDIDATES = 5
 _DISTINCT_M = 3e-3
 _MARGIN = 1.15
-_MIN_SHARE = 0.5
+_MIN_SHARE = 0.85
+"""Of the overlap that must agree: on a wrong key of a keyboard some 0.82 do, on the right one 0.9 and more."""
 _MIN_OVERLAP = 200
 _ICP_STEPS = 30
 _MAX_ANGLE_COSINE = 0.7
 _MAX_COLOUR = 60.0
+_SAME_M = 1.5e-4
+"""Farther from the plane than this, a point is not where the other map has it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +59,7 @@ class Registration:
         T_target_source: (4, 4).
         rms_m: of the point-to-plane distances of the overlap.
         overlap: points of the source that the target has too.
-        agreeing: share of these that agree in normal and colour.
+        agreeing: share of these that agree in place, normal and colour.
     """
 
     T_target_source: FloatArray
@@ -66,8 +69,8 @@ class Registration:
 
     @property
     def score(self) -> float:
-        """Agreeing points."""
-        return self.overlap * self.agreeing**2
+        """How much speaks for it: a large overlap that disagrees speaks for nothing."""
+        return self.overlap * max(self.agreeing - _MIN_SHARE, 0.0)
 
 
 def register(target: Surface, source: Surface, seed: int = 0) -> Registration:
@@ -119,6 +122,7 @@ def refine(target: Surface, source: Surface, T_target_source: FloatArray) -> Reg
         return Registration(T, 0.0, 0, 0.0)
     off = np.einsum("ni,ni->n", points[near] - target.points[at], target.normals[at])
     alike = np.einsum("ni,ni->n", normals[near], target.normals[at]) > _MAX_ANGLE_COSINE
+    alike &= np.abs(off) < _SAME_M
     alike &= ~(np.abs(source.colours[near] - target.colours[at]).max(axis=1) > _MAX_COLOUR)
     return Registration(T, float(np.sqrt((off**2).mean())), len(near), float(alike.mean()))
 
