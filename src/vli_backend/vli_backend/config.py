@@ -100,6 +100,13 @@ class BackEndConfig:
         maximum=1.0,
         doc="a start without laser waits until the IMU knows the scale this well, relative; lower: starts later, truer",
     )
+    start_patience_s: float = parameter(
+        5.0,
+        unit="s",
+        minimum=0.1,
+        maximum=1000.0,
+        doc="in motion for longer without a start, that sigma grows in proportion, up to 0.15; the scale is sharpened later",
+    )
     min_landmarks: int = parameter(
         12, unit="features", minimum=5, maximum=200, doc="fewer in a frame: DEGRADED, the IMU carries it"
     )

@@ -21,6 +21,10 @@ from vli_common.types import FrontEndOutput, LaserScan, Mode, Preintegration, Tr
 
 _SCAN_MEMORY_NS = 4_000_000_000
 _MIN_FEATURES = 15
+_RETRY_NS = 250_000_000
+"""Between two attempts of a start without laser: each adjusts up to thirty keyframes."""
+_WORST_SCALE = 0.15
+"""Relative sigma of the scale beyond which no patience starts a window."""
 _FRAMES_WITHOUT_IMU = 5
 _VISUAL_WINDOWS = 3
 """Window lengths over which a start without laser compares images and IMU: the longer, the better it knows the scale."""
@@ -48,6 +52,8 @@ class Starter:
         self._scans: list[LaserScan] = []
         self._moved = False
         self._without_imu = 0
+        self._motion_since_ns = 0
+        self._tried_ns = 0
         self.reason = "waiting for the first keyframe"
 
     def add_scan(self, scan: LaserScan) -> None:
@@ -67,6 +73,8 @@ class Starter:
         self._without_imu = self._without_imu + 1 if frame.preintegration is None and self._mode.uses_imu else 0
         self._keep(frame)
         self._moved |= not tracks.stationary
+        if tracks.stationary or not self._motion_since_ns:
+            self._motion_since_ns = tracks.stamp_ns
         if problem := self._missing(tracks):
             self.reason = problem
             return None
@@ -114,6 +122,7 @@ class Starter:
     def _start_at_rest(self, frame: FrontEndOutput, place: DeadReckoning) -> WindowEstimator | None:
         first = self._keyframes[-1].tracks
         if not self._mode.uses_imu:
+            self.reason = "started without IMU"
             return self._estimator(first, KeyframeState(place.at(first.stamp_ns), np.zeros(3), np.zeros(3), np.zeros(3)), 0.05)
         pim = _measurements(frame.preintegration)
         if pim is None or pim.deltaTij() < self._config.start_rest_s:
@@ -154,9 +163,14 @@ class Starter:
                 f"{len(self._keyframes)} of {config.start_min_keyframes} keyframes; without the laser the scale needs motion"
             )
             return None
-        intervals = self._between[:-1]
         tracks = [frame.tracks for frame in self._keyframes]
-        found = start_from_vision(self._calibration, config, tracks[0], intervals, self._depths.first)
+        if tracks[-1].stamp_ns - self._tried_ns < _RETRY_NS:
+            return None
+        self._tried_ns = tracks[-1].stamp_ns
+        intervals = self._between[:-1]
+        waited_s = (tracks[-1].stamp_ns - self._motion_since_ns) * 1e-9
+        sigma = min(config.start_scale_sigma * max(1.0, waited_s / config.start_patience_s), _WORST_SCALE)
+        found = start_from_vision(self._calibration, config, tracks[0], intervals, self._depths.first, sigma)
         if found.problem:
             self.reason = found.problem
             return None

@@ -55,7 +55,12 @@ class VisualStart:
 
 
 def start_from_vision(
-    calibration: Calibration, config: BackEndConfig, first: Tracks, intervals: list[list[FrontEndOutput]], guess_m: float
+    calibration: Calibration,
+    config: BackEndConfig,
+    first: Tracks,
+    intervals: list[list[FrontEndOutput]],
+    guess_m: float,
+    scale_sigma: float,
 ) -> VisualStart:
     """Return metric states of the K keyframes, or why the motion so far does not tell them.
 
@@ -65,6 +70,7 @@ def start_from_vision(
         first: tracks of the first keyframe.
         intervals: K − 1 lists of frames after a keyframe, up to and with the next one; each has its preintegration.
         guess_m: a first depth; only how the numbers are scaled depends on it.
+        scale_sigma: how well the scale must be known, relative.
     """
     tracks = [first, *(interval[-1].tracks for interval in intervals)]
     T_cam_imu = calibration.T_cam_imu if calibration.T_cam_imu is not None else np.eye(4)
@@ -79,7 +85,7 @@ def start_from_vision(
     T_world_keyframe = pose(poses[:, :3, :3] @ T_cam_imu[:3, :3], poses[:, :3, 3])
     sigmas = alignment_sigmas(calibration, config, depth)
     found = align_structure(T_world_keyframe, visual, inverse(T_cam_imu)[:3, 3], sigmas)
-    if problem := _doubt(found, config):
+    if problem := _doubt(found, scale_sigma):
         return _failed(problem)
     return VisualStart(_states(poses, found, inverse(T_cam_imu)[:3, 3]), depth * found.scale, found.scale_sigma)
 
@@ -145,11 +151,11 @@ def alignment_sigmas(calibration: Calibration, config: BackEndConfig, depth: flo
     )
 
 
-def _doubt(found: InertialAlignment, config: BackEndConfig) -> str:
+def _doubt(found: InertialAlignment, scale_sigma: float) -> str:
     """Return why the alignment is not to be believed yet, or nothing."""
-    if found.scale <= 0.0 or found.scale_sigma > config.start_scale_sigma:
+    if found.scale <= 0.0 or found.scale_sigma > scale_sigma:
         spread = "unknown" if found.scale <= 0.0 else f"known to {100 * found.scale_sigma:.0f} %"
-        return f"scale {spread}, {100 * config.start_scale_sigma:.0f} % are needed: move less evenly"
+        return f"scale {spread}, {100 * scale_sigma:.0f} % are needed: move less evenly"
     if abs(found.gravity_norm - GRAVITY) > 0.15 * GRAVITY:
         return f"gravity comes out as {found.gravity_norm:.1f} m/s²"
     return ""
