@@ -31,6 +31,7 @@ setup(
         "vli_simulation==0.1.0",
         "matplotlib>=3.6",
         "numpy>=1.26",
+        "opencv-python-headless>=4.6,<5",
         "PyYAML>=6.0",
         "scipy>=1.11",
         "tqdm>=4.64",

@@ -24,7 +24,7 @@ setup(
         "Jinja2>=3.1",
         "matplotlib>=3.6",
         "numpy>=1.26",
-        "opencv-python-headless>=4.6,<5",
+        "opencv-python-headless>=4.7,<5",
         "PyYAML>=6.0",
         "scipy>=1.11",
         "tqdm>=4.64",
