@@ -120,8 +120,9 @@ def test_images_of_another_size_are_refused(scene, calibration, tmp_path, capsys
 
 
 def test_an_unknown_kind_of_topic_is_refused(bag, calibration, capsys) -> None:
-    assert run(bag, calibration, "--topic", "laser=/x") == 2
-    assert "--topic is 'laser=/x', expected image=/name or imu=/name" in capsys.readouterr().err
+    with pytest.raises(SystemExit, match="2"):
+        run(bag, calibration, "--topic", "laser=/x")
+    assert "'laser=/x', expected image=/name or imu=/name" in capsys.readouterr().err
 
 
 @pytest.mark.slow

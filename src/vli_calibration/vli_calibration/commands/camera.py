@@ -14,7 +14,7 @@ from vli_calibration.documents import write_document
 from vli_calibration.images import read_images
 from vli_calibration.tables import text_table
 from vli_calibration.targets import FORMS, parse_target
-from vli_driver.bag import DEFAULT_IMAGE_TOPIC
+from vli_calibration.topics import add_topic_argument, topic
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -23,14 +23,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--target", required=True, metavar="T", help=FORMS.replace("%", "%%"))
     parser.add_argument("--out", type=Path, required=True, metavar="C", help="calibration file; its other sections are kept")
     parser.add_argument("--model", choices=tuple(MODEL_CHOICES), default="auto", help="lens model (default: %(default)s)")
-    parser.add_argument("--topic", default=DEFAULT_IMAGE_TOPIC, metavar="/NAME", help="of a bag's images (default: %(default)s)")
+    add_topic_argument(parser, "image")
     parser.add_argument("--report", type=Path, metavar="DIR", help="write report.html and summary.json there")
 
 
 def run(args: argparse.Namespace) -> int:
     """Find the target, fit the camera, write it, say what it is worth."""
     target = parse_target(args.target)
-    images = read_images(args.source, image_topic=args.topic)
+    images = read_images(args.source, image_topic=topic(args, "image"))
     found = calibrate_camera(images, target, args.model, args.report or args.out.parent, str(args.source))
     command = f"vli calibrate camera {args.source} --target {args.target} --model {args.model}"
     write_document(args.out, "cam0", camera_report.section(found.fit), camera_report.provenance(found, command))

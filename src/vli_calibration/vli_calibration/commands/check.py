@@ -13,9 +13,9 @@ from vli_calibration.laser_model import LaserPlane
 from vli_calibration.laser_report import distance_rows
 from vli_calibration.tables import text_table
 from vli_calibration.targets import FORMS, parse_target
+from vli_calibration.topics import add_topic_argument, topic
 from vli_common.calibration import load_calibration
 from vli_common.errors import CalibrationError
-from vli_driver.bag import DEFAULT_IMAGE_TOPIC
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--target", required=True, metavar="T", help=FORMS.replace("%", "%%"))
     parser.add_argument("--calib", type=Path, required=True, metavar="C", help="calibration with cam0 and laser0")
-    parser.add_argument("--topic", default=DEFAULT_IMAGE_TOPIC, metavar="/NAME", help="of a bag's images (default: %(default)s)")
+    add_topic_argument(parser, "image")
     parser.add_argument("--report", type=Path, metavar="DIR", help="write report.html and summary.json there")
 
 
@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
     if calibration.laser is None:
         raise CalibrationError(str(args.calib), ["section 'laser0' is missing; make it with 'vli calibrate laser'"])
     plane = LaserPlane(calibration.laser.normal, calibration.laser.d)
-    check = check_laser(read_images(args.source, image_topic=args.topic), target, calibration.camera, plane)
+    check = check_laser(read_images(args.source, image_topic=topic(args, "image")), target, calibration.camera, plane)
     if args.report is not None:
         check_report.make_report(check).write(args.report, check_report.summary(check))
     write = sys.stdout.write

@@ -11,7 +11,7 @@ from vli_calibration.allan import measure_imu_noise
 from vli_calibration.documents import write_document
 from vli_calibration.imu_recording import read_imu_recording
 from vli_calibration.tables import text_table
-from vli_driver.bag import DEFAULT_IMU_TOPIC
+from vli_calibration.topics import add_topic_argument, topic
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -19,13 +19,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("source", type=Path, metavar="BAG", help="the IMU at rest, hours of it; images are ignored")
     parser.add_argument("--out", type=Path, required=True, metavar="C", help="calibration file; its other sections are kept")
     parser.add_argument("--calib", type=Path, metavar="C", help="take the other sections from this file")
-    parser.add_argument("--topic", default=DEFAULT_IMU_TOPIC, metavar="/NAME", help="of the IMU (default: %(default)s)")
+    add_topic_argument(parser, "imu")
     parser.add_argument("--report", type=Path, metavar="DIR", help="write report.html and summary.json there")
 
 
 def run(args: argparse.Namespace) -> int:
     """Measure, write, say what it is worth."""
-    recording = read_imu_recording(args.source, args.topic)
+    recording = read_imu_recording(args.source, topic(args, "imu"))
     noise = measure_imu_noise(recording)
     sentences = imu_report.remarks(noise, recording)
     command = f"vli calibrate imu {args.source}"

@@ -17,11 +17,11 @@ from vli_calibration.imu_camera import LEAST_FRAMES, ImuCameraFit, fit_imu_camer
 from vli_calibration.imu_recording import read_imu_recording
 from vli_calibration.tables import text_table
 from vli_calibration.targets import FORMS, parse_target
+from vli_calibration.topics import add_topic_argument, topic
 from vli_common.arrays import FloatArray
 from vli_common.calibration import load_calibration
 from vli_common.errors import CalibrationError, InputError
 from vli_common.geometry import pose
-from vli_driver.bag import DEFAULT_IMAGE_TOPIC, DEFAULT_IMU_TOPIC
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -31,9 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--calib", type=Path, required=True, metavar="C", help="calibration with cam0 and imu0")
     parser.add_argument("--imu-calib", type=Path, metavar="F", help="Kalibr's imu.yaml, in place of imu0")
     parser.add_argument("--out", type=Path, required=True, metavar="C", help="calibration file to write, all else as in --calib")
-    parser.add_argument(
-        "--topic", action="append", default=[], metavar="KIND=/NAME", help="image=/NAME or imu=/NAME, where not the usual ones"
-    )
+    add_topic_argument(parser, "image", "imu")
     parser.add_argument("--report", type=Path, metavar="DIR", help="write report.html and summary.json there")
 
 
@@ -47,9 +45,8 @@ def run(args: argparse.Namespace) -> int:
             ["section 'imu0' is missing, the IMU's noise decides how far to trust it; make it with 'vli calibrate imu', or pass "
              "Kalibr's file with '--imu-calib'"],
         )  # fmt: skip
-    topics = _topics(args.topic)
-    recording = read_imu_recording(args.source, topics["imu"])
-    seen = find_board(args.source, target, calibration.camera, topics["image"])
+    recording = read_imu_recording(args.source, topic(args, "imu"))
+    seen = find_board(args.source, target, calibration.camera, topic(args, "image"))
     _check_seen(seen, target)
     track = track_board(seen.stamps_ns, seen.detections, calibration.camera, target.points, _half_turn(target))
     fit = fit_imu_camera(track, recording, calibration.imu)
@@ -86,13 +83,3 @@ def _check_seen(seen: BoardFrames, target: Target) -> None:
 def _half_turn(target: Target) -> FloatArray | None:
     """Return T_board_turned of a board that looks the same turned by 180°."""
     return pose(np.diag([-1.0, -1.0, 1.0]), target.points[0] + target.points[-1]) if target.symmetric else None
-
-
-def _topics(settings: list[str]) -> dict[str, str]:
-    topics = {"image": DEFAULT_IMAGE_TOPIC, "imu": DEFAULT_IMU_TOPIC}
-    for setting in settings:
-        kind, found, name = setting.partition("=")
-        if not found or kind not in topics:
-            raise InputError(f"--topic is '{setting}', expected image=/name or imu=/name")
-        topics[kind] = name
-    return topics

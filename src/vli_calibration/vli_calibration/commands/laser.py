@@ -18,11 +18,11 @@ from vli_calibration.laser_calibration import LaserFit, LaserOptions, calibrate_
 from vli_calibration.laser_model import camera_parameters
 from vli_calibration.tables import text_table
 from vli_calibration.targets import FORMS, parse_target
+from vli_calibration.topics import add_topic_argument, topic
 from vli_common.arrays import FloatArray
 from vli_common.calibration import load_calibration
 from vli_common.camera import CameraModel
 from vli_common.errors import InputError
-from vli_driver.bag import DEFAULT_IMAGE_TOPIC
 
 _HALF_WIDTH_SIGMAS = 2.0
 
@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--range", type=float, nargs=2, metavar=("NEAR", "FAR"), help="working range, metres; default: from the images"
     )
-    parser.add_argument("--topic", default=DEFAULT_IMAGE_TOPIC, metavar="/NAME", help="of a bag's images (default: %(default)s)")
+    add_topic_argument(parser, "image")
     parser.add_argument("--report", type=Path, metavar="DIR", help="write report.html and summary.json there")
 
 
@@ -52,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
     target = parse_target(args.target)
     document = read_document(args.calib)
     camera = load_calibration(args.calib, None).camera
-    images = read_images(args.source, args.poses, args.topic)
+    images = read_images(args.source, args.poses, topic(args, "image"))
     options = LaserOptions(not args.hold_camera, known_sigmas(document, camera))
     fit = calibrate_laser(images, target, camera, options)
     if args.range is not None:
