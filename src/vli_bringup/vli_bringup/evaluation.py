@@ -22,8 +22,9 @@ from vli_bringup.map_metrics import (
     surface_distances,
     surface_figures,
 )
-from vli_bringup.output import SUMMARY
+from vli_bringup.output import CONFIG, SUMMARY
 from vli_bringup.report import Evaluation, RunFigures, as_dict, as_text
+from vli_bringup.settings import load_settings
 from vli_bringup.trajectory_metrics import (
     Association,
     TrajectoryErrors,
@@ -158,6 +159,8 @@ def evaluate(sources: Sources, poses_from_s: float = STARTUP_S) -> Result:
     live_errors, live_figures = figures(live_pairs)
     final_errors, final_figures = figures(final_pairs) if final_pairs else (None, None)
     cloud = _read_map(sources.run)
+    if cloud is not None and sources.seen:
+        _note_compensation(sources.run)
     mapped, surface, completeness = _compare_map(cloud, T_truth_map, sources)
     share = poses_share(live.stamps_ns, truth.stamps_ns, poses_from_s)
     run_figures = _run_figures(sources.run, share, poses_from_s, None if cloud is None else len(cloud))
@@ -185,6 +188,13 @@ def _read_map(directory: Path) -> PointCloud | None:
         return read_cloud(path)
     _note(f"'{path}' does not exist: no figures of a map")
     return None
+
+
+def _note_compensation(directory: Path) -> None:
+    """Say that colours which the light was taken out of are not those that were seen."""
+    path = directory / CONFIG
+    if path.is_file() and load_settings(path).mapping.colour == "compensated":
+        _note("the light is taken out of the map's colours: for a figure against the colours as seen, run with --colour lit")
 
 
 def _compare_map(

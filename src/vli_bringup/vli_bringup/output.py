@@ -11,6 +11,7 @@ from types import TracebackType
 from vli_common.errors import OutputError
 
 SUMMARY = "summary.json"
+CONFIG = "config.yaml"
 _DEFAULT_ROOT = Path("results")
 _LATEST = "latest"
 

@@ -16,7 +16,7 @@ from vli_bringup.arguments import add_scan_arguments, bag_topics, source_setting
 from vli_bringup.graph import SCANNER, STAGES, Playback, describe_graph
 from vli_bringup.input_checks import check_input
 from vli_bringup.listener import LISTENER, GraphListener
-from vli_bringup.output import SUMMARY, ResultsDirectory
+from vli_bringup.output import CONFIG, SUMMARY, ResultsDirectory
 from vli_bringup.processes import GraphError, NodeProcesses
 from vli_bringup.recorder import Recorder
 from vli_bringup.settings import Settings, to_yaml
@@ -94,7 +94,7 @@ def replay(options: ReplayOptions, directory: Path, started_s: float) -> dict[st
         GraphError: a node failed.
     """
     recorder = Recorder(options.calibration)
-    parameter_file = directory / "config.yaml"
+    parameter_file = directory / CONFIG
     parameter_file.write_text(to_yaml(options.settings))
     nodes = describe_graph(
         options.calibration_path, options.mode, options.imu_calibration_path, options.playback, directory / _MAP, LISTENER

@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from vli_bringup.arguments import add_scan_arguments, bag_topics, source_settings
 from vli_bringup.input_checks import check_input
-from vli_bringup.output import SUMMARY, ResultsDirectory
+from vli_bringup.output import CONFIG, SUMMARY, ResultsDirectory
 from vli_bringup.pipeline import Pipeline, Stages
 from vli_bringup.recorder import Recorder
 from vli_bringup.settings import Settings, to_yaml
@@ -114,7 +114,7 @@ def write(directory: Path, pipeline: Pipeline, recorder: Recorder, clock: Clock,
     save_map(directory / f"map{SUFFIX}", take(pipeline.stages.mapper.map, pipeline.stages.mapper.light()))
     write_views(directory / "cloud.png", cloud)
     pipeline.timer.write(directory / "timing.csv")
-    (directory / "config.yaml").write_text(to_yaml(settings))
+    (directory / CONFIG).write_text(to_yaml(settings))
     summary = {
         "frames_long": pipeline.counters["long_images"],
         "frames_short": pipeline.counters["short_images"],
