@@ -25,6 +25,19 @@ def read_document(path: Path) -> dict[str, Any]:
     return load_document(path)
 
 
+def check_target_file(path: Path, base: Path | None = None) -> None:
+    """Raise, before anything is computed, where ``path`` could not be written; arguments as in :func:`write_document`.
+
+    Raises:
+        CalibrationError: what ``path`` holds, and would be merged into, is no calibration.
+        OutputError: it is a directory.
+    """
+    if path.is_dir():
+        raise OutputError(f"'{path}' is a directory, expected the calibration file to write, such as '{path / 'scanner.yaml'}'")
+    if base is None and path.exists():
+        read_document(path)
+
+
 def merged(
     document: Mapping[str, Any],
     section: str,

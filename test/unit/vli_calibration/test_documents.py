@@ -5,7 +5,7 @@ import copy
 import pytest
 import yaml
 
-from vli_calibration.documents import read_document, save_document, write_document
+from vli_calibration.documents import check_target_file, read_document, save_document, write_document
 from vli_common.calibration import load_calibration
 from vli_common.errors import CalibrationError, OutputError
 from vli_common.types import Mode
@@ -119,3 +119,14 @@ def test_the_plane_is_written_with_a_positive_distance_and_the_input_is_left_alo
     write_document(tmp_path / "c.yaml", "laser0", values, {})
     assert read_document(tmp_path / "c.yaml")["laser0"]["plane"][3] == 0.016
     assert values == before
+
+
+def test_a_file_that_could_not_be_written_is_told_before_anything_is_computed(tmp_path):
+    with pytest.raises(OutputError, match="is a directory, expected the calibration file to write"):
+        check_target_file(tmp_path)
+    broken = tmp_path / "broken.yaml"
+    broken.write_text("cam0: [")
+    with pytest.raises(CalibrationError, match=r"broken\.yaml"):
+        check_target_file(broken)
+    check_target_file(broken, base=tmp_path / "other.yaml")
+    check_target_file(tmp_path / "new.yaml")

@@ -10,7 +10,7 @@ from vli_calibration import camera_report
 from vli_calibration.camera_calibration import calibrate_camera
 from vli_calibration.camera_quality import remarks, verdict
 from vli_calibration.camera_selection import MODEL_CHOICES
-from vli_calibration.documents import write_document
+from vli_calibration.documents import check_target_file, write_document
 from vli_calibration.images import read_images
 from vli_calibration.tables import text_table
 from vli_calibration.targets import FORMS, parse_target
@@ -29,6 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Find the target, fit the camera, write it, say what it is worth."""
+    check_target_file(args.out)
     target = parse_target(args.target)
     images = read_images(args.source, image_topic=topic(args, "image"))
     found = calibrate_camera(images, target, args.model, args.report or args.out.parent, str(args.source))

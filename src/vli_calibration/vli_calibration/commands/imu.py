@@ -8,7 +8,7 @@ from pathlib import Path
 
 from vli_calibration import imu_report
 from vli_calibration.allan import measure_imu_noise
-from vli_calibration.documents import write_document
+from vli_calibration.documents import check_target_file, write_document
 from vli_calibration.imu_recording import read_imu_recording
 from vli_calibration.tables import text_table
 from vli_calibration.topics import add_topic_argument, topic
@@ -25,6 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, write, say what it is worth."""
+    check_target_file(args.out, args.calib)
     recording = read_imu_recording(args.source, topic(args, "imu"))
     noise = measure_imu_noise(recording)
     sentences = imu_report.remarks(noise, recording)

@@ -12,7 +12,7 @@ from vli_calibration import imu_camera_report
 from vli_calibration.board_bag import BoardFrames, find_board
 from vli_calibration.board_track import track_board
 from vli_calibration.boards import Target
-from vli_calibration.documents import write_document
+from vli_calibration.documents import check_target_file, write_document
 from vli_calibration.imu_camera import LEAST_FRAMES, ImuCameraFit, fit_imu_camera
 from vli_calibration.imu_recording import read_imu_recording
 from vli_calibration.tables import text_table
@@ -37,6 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Find the board, fit, write, say what it is worth."""
+    check_target_file(args.out, args.calib)
     target = parse_target(args.target)
     calibration = load_calibration(args.calib, None, args.imu_calib)
     if calibration.imu is None:

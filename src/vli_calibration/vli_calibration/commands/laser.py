@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from vli_calibration import laser_report
-from vli_calibration.documents import merged, read_document, save_document
+from vli_calibration.documents import check_target_file, merged, read_document, save_document
 from vli_calibration.images import read_images
 from vli_calibration.laser_calibration import LaserFit, LaserOptions, calibrate_laser
 from vli_calibration.laser_model import camera_parameters
@@ -49,6 +49,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Find boards and stripes, fit the plane, write it, say what it is worth."""
+    check_target_file(args.out, args.calib)
     target = parse_target(args.target)
     document = read_document(args.calib)
     camera = load_calibration(args.calib, None).camera
