@@ -221,12 +221,11 @@ def test_the_doctor_listens_to_a_running_sensor(tmp_path: Path, calibration: Pat
     try:
         deadline_s = time.monotonic() + _START_S
         out = ""
-        while "IMU and camera overlap" not in out:
+        while "IMU and camera overlap" not in out or "driver_node" not in out:
             assert time.monotonic() < deadline_s, out
             main(["doctor", "--live", "--duration", "2", "--calib", str(calibration)])
             out = capsys.readouterr().out
         assert "long and" in out
-        assert "driver_node" in out
         assert "measures gravity in m/s²" in out
     finally:
         driver.terminate()

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 
 import numpy as np
 import pytest
@@ -85,11 +86,14 @@ def test_the_final_trajectory_has_the_frames_of_the_live_one_nearby(results):
     assert np.abs(live.positions - final.positions).max() < 5e-3
 
 
-def test_timing_has_a_row_a_long_frame_and_adds_up_to_the_summary(results, summary):
+def test_timing_has_a_row_a_long_frame_and_makes_up_the_summary(results, summary):
+    """The camera has a thread of its own: a frame takes no less than the main thread's stages, and less than all of them."""
     rows = list(csv.DictReader((results / "timing.csv").open()))
     assert len(rows) == summary["frames_long"]
     totals = [float(row["total_ms"]) for row in rows]
-    np.testing.assert_allclose(totals, [sum(float(row[f"{stage}_ms"]) for stage in STAGES) for row in rows], atol=0.01)
+    by_stage = {stage: np.array([float(row[f"{stage}_ms"]) for row in rows]) for stage in STAGES}
+    assert (totals > by_stage["frontend"] + by_stage["backend"] + by_stage["mapping"] - 0.01).all()
+    assert np.mean(totals) < np.mean(sum(by_stage.values()))
     assert np.mean(totals) == pytest.approx(summary["ms_per_frame_mean"], abs=0.01)
     assert sum(totals) < 1e3 * summary["wall_s"]
 
@@ -121,7 +125,9 @@ def test_the_other_modes_run(scan, tmp_path, mode):
 def test_an_interrupt_stops_the_run_at_once_and_leaves_nothing(shared_data, tmp_path):
     recording = shared_data / "keyboard_short"
     command = [sys.executable, "-m", "vli_bringup.cli", "run", recording / "bag", "--calib", recording / "calibration.yaml"]
-    process = subprocess.Popen([*command, "--out", tmp_path / "out"], stderr=subprocess.PIPE, text=True)
+    # Who runs the tests in the background of a shell hands on an ignored SIGINT.
+    listen = partial(signal.signal, signal.SIGINT, signal.default_int_handler)
+    process = subprocess.Popen([*command, "--out", tmp_path / "out"], stderr=subprocess.PIPE, text=True, preexec_fn=listen)
     while not (tmp_path / "out.partial").exists() and process.poll() is None:
         time.sleep(0.05)
     time.sleep(1.0)

@@ -45,9 +45,10 @@ STAGES = (
 
 NODE_ONLY = frozenset(
     {
-        *("mode", "calibration_file", "imu_calibration_file"),
+        *("mode", "calibration_file", "imu_calibration_file", "autostart"),
         *("bag", "rate", "loop", "start", "duration", "wait_for", "wait_timeout"),
-        *("image_topic", "exposure_topic", "imu_topic", "save_path"),
+        *("image_topic", "exposure_topic", "imu_topic"),
+        *("save_path", "load_path", "export_path", "autosave_s", "autosave_path"),
     }
 )
 """Parameters of nodes that are no parameter of a stage; a parameter file may hold them, and only the nodes mind them."""

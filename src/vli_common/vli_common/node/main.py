@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import faulthandler
 import os
 import signal
 import sys
@@ -24,6 +25,8 @@ _REST_S = 2e-3
 """What comes in this time is taken in one round of the executor; see :func:`vli_common.node.transport.pending`."""
 _SIGNAL_S = 0.1
 """A signal is answered this late at most: the executor's wait does not end with it."""
+_TEARDOWN_S = 3.0
+"""The middleware may take this long to let go of a node that has stopped, its worker's last job included."""
 _UNUSABLE = 2
 _FAILED = 1
 
@@ -62,9 +65,17 @@ def _run(factory: Callable[[], VliNode], stop: threading.Event) -> tuple[int, bo
     except VliError as error:
         code = _UNUSABLE
         sys.stderr.write(f"{error}\n")
-    finally:
-        stopped = node.close()
-    return code or (_FAILED if node.failure else 0), stopped
+    code = code or (_FAILED if node.failure else 0)
+    _limit_teardown(code)
+    return code, node.close()
+
+
+def _limit_teardown(code: int) -> None:
+    """Let the process end in time whatever the middleware does; where it hangs in native code, say where."""
+    limit = threading.Timer(_TEARDOWN_S, os._exit, [code])
+    limit.daemon = True
+    limit.start()
+    faulthandler.dump_traceback_later(2 * _TEARDOWN_S, exit=True)
 
 
 def _spin(node: VliNode, stop: threading.Event) -> None:
