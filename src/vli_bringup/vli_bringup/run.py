@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 from tqdm import tqdm
 
 from vli_bringup.arguments import add_scan_arguments, bag_topics, source_settings
@@ -28,6 +29,8 @@ from vli_mapping.snapshot import take
 from vli_mapping.store import write_ply
 
 NEVER_TRACKED = 1
+_SWITCH_S = 2e-4
+"""How soon a thread that needs the interpreter gets it; Python's default of 5 ms is a whole frame's time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +79,7 @@ def run(args: argparse.Namespace) -> int:
     reader = BagReader(args.bag, topics, args.start, args.duration)
     results = ResultsDirectory(args.out, args.overwrite)
     with results as directory:
+        _share_processor()
         warm_up()
         pipeline = Pipeline(Stages.create(calibration, settings, mode), mode)
         recorder = Recorder(calibration)
@@ -84,6 +88,12 @@ def run(args: argparse.Namespace) -> int:
     for warning in [*warnings, *reader.warnings, *_losses(pipeline)]:
         _note(f"warning: {warning}")
     return report(pipeline, recorder, results.path)
+
+
+def _share_processor() -> None:
+    """Leave one core each to the two threads of the pipeline: OpenCV's own would take it from them."""
+    sys.setswitchinterval(_SWITCH_S)
+    cv2.setNumThreads(1)
 
 
 def process(reader: BagReader, pipeline: Pipeline, recorder: Recorder, duration_s: float, started_s: float) -> Clock:
