@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 
 from vli_bringup.settings import Settings, load_settings
 from vli_common.types import Mode
 from vli_driver.bag import BagTopics
+from vli_driver.config import DriverConfig
 from vli_mapping.config import AS_SEEN, COMPENSATED
 
 _TOPICS = {"image": "image_topic", "imu": "imu_topic", "camera_info": "camera_info_topic", "exposure": "exposure_topic"}
@@ -36,7 +38,12 @@ def add_source_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", metavar="F", type=Path, help="parameters, in the form of config/vli.yaml")
     parser.add_argument("--set", metavar="STAGE.KEY=VALUE", action="append", default=[], help="one parameter; may be repeated")
     parser.add_argument("--start", metavar="S", type=_seconds, default=0.0, help="skip the first S seconds")
-    parser.add_argument("--duration", metavar="D", type=_seconds, help="stop after D seconds")
+    parser.add_argument("--duration", metavar="D", type=duration, help="stop after D seconds")
+    add_topic_argument(parser)
+
+
+def add_topic_argument(parser: argparse.ArgumentParser) -> None:
+    """Add the choice of topics."""
     parser.add_argument(
         "--topic", metavar="NAME=/TOPIC", type=_topic, action="append", default=[], help=f"NAME is one of {', '.join(_TOPICS)}"
     )
@@ -49,8 +56,16 @@ def source_settings(args: argparse.Namespace) -> Settings:
         ConfigError: unknown names or invalid values, all of them at once.
     """
     colour = [f"mapping.colour={args.colour}"] if args.colour else []
-    topics = [f"driver.{_TOPICS[name]}={topic}" for name, topic in args.topic]
-    return load_settings(args.config, [*args.set, *colour, *topics])
+    return load_settings(args.config, [*args.set, *colour, *_topic_settings(args)])
+
+
+def chosen_topics(args: argparse.Namespace) -> DriverConfig:
+    """Return the names that ``--topic`` gives, for commands that have no other parameters."""
+    return load_settings(None, _topic_settings(args)).driver
+
+
+def _topic_settings(args: argparse.Namespace) -> list[str]:
+    return [f"driver.{_TOPICS[name]}={topic}" for name, topic in args.topic]
 
 
 def bag_topics(settings: Settings, mode: Mode) -> BagTopics:
@@ -59,10 +74,26 @@ def bag_topics(settings: Settings, mode: Mode) -> BagTopics:
     return BagTopics(driver.image_topic, driver.imu_topic, driver.camera_info_topic, driver.exposure_topic, mode.uses_imu)
 
 
+def number(text: str) -> float:
+    """Return the number, NaN for what is none: the caller says what it expects."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
 def _seconds(text: str) -> float:
-    value = float(text)
-    if not 0.0 <= value < float("inf"):
+    value = number(text)
+    if not 0.0 <= value < math.inf:
         raise argparse.ArgumentTypeError(f"'{text}', expected seconds, 0 or more")
+    return value
+
+
+def duration(text: str) -> float:
+    """Return seconds, more than zero; for ``type`` of an argument."""
+    value = number(text)
+    if not 0.0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"'{text}', expected seconds, more than 0")
     return value
 
 

@@ -13,6 +13,7 @@ from vli_bringup.diagnosis.calibration import check_calibration
 from vli_bringup.diagnosis.camera import CameraCheck
 from vli_bringup.diagnosis.findings import Check, Finding, Level, to_text, worst
 from vli_bringup.diagnosis.imu import ImuCheck
+from vli_bringup.input_checks import check_part
 from vli_bringup.settings import Settings
 from vli_common.calibration import Calibration, load_calibration
 from vli_common.errors import InputError
@@ -41,6 +42,8 @@ def run(args: argparse.Namespace) -> int:
     """
     if (args.bag is None) == (not args.live):
         raise InputError("expected either a BAG or --live; see 'vli doctor --help'")
+    if args.live and args.start:
+        raise InputError(f"--start is '{args.start:g}', which is of a bag; with --live give --duration alone")
     settings = source_settings(args)
     calibration = load_calibration(args.calib, None, args.imu_calib) if args.calib else None
     findings = list(check_calibration(args.calib, args.imu_calib, calibration)) if calibration else []
@@ -71,6 +74,7 @@ def _read(settings: Settings, calibration: Calibration | None, args: argparse.Na
     """Diagnose the first 20 s of a bag, or what is asked for."""
     topics = replace(bag_topics(settings, Mode.VLI_SLAM), imu_required=False)
     reader = BagReader(args.bag, topics, args.start, _SPAN_S if args.duration is None else args.duration)
+    check_part(reader)
     checks: list[Check] = [CameraCheck(calibration, settings)]
     findings = []
     if reader.imu_topic:

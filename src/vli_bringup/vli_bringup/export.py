@@ -14,6 +14,7 @@ from vli_mapping.export import CLOUD_WRITERS, write_cloud
 from vli_mapping.map_file import SUFFIX, load_map
 from vli_mapping.mesh import MESH_SUFFIXES, VOXEL_M, make_mesh, write_mesh
 from vli_mapping.snapshot import restore
+from vli_mapping.store import check_place
 
 _MM = 1e-3
 
@@ -41,6 +42,7 @@ def run(args: argparse.Namespace) -> int:
         raise OutputError(f"'{args.out}' ends in '{args.out.suffix}', expected one of {', '.join(valid)}")
     if not 0.01 <= args.voxel <= 10:
         raise InputError(f"--voxel is '{args.voxel:g}', expected 0.01 to 10 mm")
+    check_place(args.out)
     cloud = read_map(args.map, args.colour)
     if not len(cloud):
         raise InputError(f"map '{args.map}' is empty, there is nothing to export")

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from vli_common.arrays import FloatArray, IntArray
+from vli_common.arrays import ByteArray, FloatArray, IntArray
 from vli_common.calibration import Calibration
 from vli_common.errors import InputError
 from vli_common.types import NANOSECONDS, ImuSample
@@ -17,6 +18,7 @@ from vli_driver.decode import decode
 _SPAN_NS = 20 * NANOSECONDS
 _GRAVITY = 9.80665
 _INTRINSICS_TOLERANCE = 0.01
+_TRIED_IMAGES = 30
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,17 +143,35 @@ def gravity_rate_scale(stamps: IntArray, gyro: FloatArray, accel: FloatArray, wi
     return float(solution[0]), float(np.sqrt(variance * np.linalg.inv(design.T @ design)[0, 0]))
 
 
+def check_part(reader: BagReader) -> None:
+    """Raise where the part of a bag that is asked for has no image."""
+    if next(reader.images(), None) is None:
+        start_ns, end_ns = reader.time_range_ns
+        raise InputError(
+            f"the part of '{reader.path}' that is asked for holds no image, the bag has "
+            f"'{(end_ns - start_ns) / NANOSECONDS:.1f}' s; choose another with --start and --duration"
+        )
+
+
 def _check_image_size(reader: BagReader, calibration: Calibration) -> None:
-    first = reader.first_image()
-    if first is None:
-        raise InputError(f"topic '{reader.image_topic}' in '{reader.path}' holds no image; see what there is with: ros2 bag info")
-    height, width = decode(first).pixels.shape[:2]
+    height, width = _first_pixels(reader).shape[:2]
     camera = calibration.camera
     if (width, height) != (camera.width, camera.height):
         raise InputError(
             f"images on '{reader.image_topic}' are '{width} x {height}', the calibration is for "
             f"{camera.width} x {camera.height}; calibrate the camera at this resolution"
         )
+
+
+def _first_pixels(reader: BagReader) -> ByteArray:
+    """Return the first image that can be decoded; one that cannot does not speak against the others."""
+    problem = InputError(f"topic '{reader.image_topic}' in '{reader.path}' holds no image; see what there is with: ros2 bag info")
+    for image in itertools.islice(reader.images(), _TRIED_IMAGES):
+        try:
+            return decode(image).pixels
+        except InputError as error:
+            problem = error
+    raise problem
 
 
 def _camera_info_warnings(info: Any, calibration: Calibration) -> list[str]:

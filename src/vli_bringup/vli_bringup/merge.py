@@ -9,6 +9,7 @@ from pathlib import Path
 from vli_common.errors import InputError, OutputError
 from vli_mapping.map_file import SUFFIX, load_map, save_map
 from vli_mapping.merging import merge_maps
+from vli_mapping.store import check_place
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -31,6 +32,7 @@ def run(args: argparse.Namespace) -> int:
         raise OutputError(
             f"'{args.out}' ends in '{args.out.suffix}', expected '{SUFFIX}'; 'vli export' makes other formats of it"
         )
+    check_place(args.out)
     snapshots = []
     for path in args.maps:
         snapshots.append(load_map(path / f"map{SUFFIX}" if path.is_dir() else path))

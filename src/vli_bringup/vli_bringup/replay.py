@@ -12,9 +12,9 @@ from typing import Any
 
 from tqdm import tqdm
 
-from vli_bringup.arguments import add_scan_arguments, bag_topics, source_settings
+from vli_bringup.arguments import add_scan_arguments, bag_topics, number, source_settings
 from vli_bringup.graph import SCANNER, STAGES, Playback, describe_graph
-from vli_bringup.input_checks import check_input
+from vli_bringup.input_checks import check_input, check_part
 from vli_bringup.listener import LISTENER, GraphListener
 from vli_bringup.output import CONFIG, SUMMARY, ResultsDirectory
 from vli_bringup.processes import GraphError, NodeProcesses
@@ -71,7 +71,9 @@ def run(args: argparse.Namespace) -> int:
     mode = Mode(args.mode)
     settings = source_settings(args)
     calibration = load_calibration(args.calib, mode, args.imu_calib)
-    warnings = check_input(BagReader(args.bag, bag_topics(settings, mode)), calibration, mode.uses_imu)
+    topics = bag_topics(settings, mode)
+    warnings = check_input(BagReader(args.bag, topics), calibration, mode.uses_imu)
+    check_part(BagReader(args.bag, topics, args.start, args.duration))
     playback = Playback(args.bag, args.rate, args.start, args.duration)
     options = ReplayOptions(playback, args.calib, args.imu_calib, calibration, settings, mode)
     results = ResultsDirectory(args.out, args.overwrite)
@@ -172,7 +174,7 @@ def _play(processes: NodeProcesses, listener: GraphListener) -> float:
 
 
 def _rate(text: str) -> float:
-    value = float(text)
+    value = number(text)
     if not 0.01 <= value <= 100.0:
         raise argparse.ArgumentTypeError(f"'{text}', expected 0.01 to 100 bag seconds a second")
     return value

@@ -14,7 +14,7 @@ import cv2
 from tqdm import tqdm
 
 from vli_bringup.arguments import add_scan_arguments, bag_topics, source_settings
-from vli_bringup.input_checks import check_input
+from vli_bringup.input_checks import check_input, check_part
 from vli_bringup.output import CONFIG, SUMMARY, ResultsDirectory
 from vli_bringup.pipeline import Pipeline, Stages
 from vli_bringup.recorder import Recorder
@@ -77,6 +77,7 @@ def run(args: argparse.Namespace) -> int:
     topics = bag_topics(settings, mode)
     warnings = check_input(BagReader(args.bag, topics), calibration, mode.uses_imu)
     reader = BagReader(args.bag, topics, args.start, args.duration)
+    check_part(reader)
     results = ResultsDirectory(args.out, args.overwrite)
     with results as directory:
         _share_processor()

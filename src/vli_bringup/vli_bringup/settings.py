@@ -6,19 +6,17 @@ The file has the form of a ROS 2 parameter file, so that nodes and ``vli run`` r
 
 from __future__ import annotations
 
-import re
 import sys
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from vli_backend.config import BackEndConfig
 from vli_bringup.graph import NODE_ONLY
 from vli_common.config import flatten, from_mapping, parameters, section, to_yaml_lines, unknown_key
-from vli_common.errors import ConfigError
+from vli_common.errors import ConfigError, InputError
+from vli_common.yaml_text import load_yaml, parse_assignments
 from vli_driver.config import DemuxConfig, DriverConfig, StripeConfig
 from vli_frontend.config import FrontEndConfig
 from vli_mapping.config import MappingConfig
@@ -51,15 +49,6 @@ class Settings:
     mapping: MappingConfig = section(MappingConfig)
 
 
-class _Loader(yaml.SafeLoader):
-    """YAML 1.1 reads 1e-3 as a string; ROS reads it as a number, and so does this."""
-
-
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float", re.compile(r"^[-+]?(\d+(\.\d*)?|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789")
-)
-
-
 def load_settings(path: Path | None = None, assignments: Iterable[str] = ()) -> Settings:
     """Return the defaults, changed by a parameter file and by assignments ``stage.key=value``, in this order.
 
@@ -67,20 +56,8 @@ def load_settings(path: Path | None = None, assignments: Iterable[str] = ()) -> 
         ConfigError: the file cannot be read, or names or values are wrong; all problems at once.
     """
     values = _read(path) if path else {}
-    problems: list[str] = []
-    for assignment in assignments:
-        name, equals, text = assignment.partition("=")
-        if not equals or not name:
-            problems.append(f"'--set {assignment}', expected --set stage.key=value, e.g. --set frontend.max_features=150")
-            continue
-        values[name.strip()] = _load(text)
-    try:
-        settings = from_mapping(Settings, values)
-    except ConfigError as error:
-        problems += error.problems
-    if problems:
-        raise ConfigError(problems)
-    return settings
+    assigned, problems = parse_assignments(assignments, "frontend.max_features=150")
+    return from_mapping(Settings, values | assigned, problems)
 
 
 def to_yaml(settings: Settings) -> str:
@@ -99,13 +76,13 @@ def to_yaml(settings: Settings) -> str:
 def _read(path: Path) -> dict[str, Any]:
     """Return the parameters of a file by dotted names ``stage.key``."""
     try:
-        document = _load(path.read_text(encoding="utf-8"))
+        document = load_yaml(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError([f"parameter file '{path}' cannot be read ({error}), expected one like config/vli.yaml"]) from error
-    except yaml.YAMLError as error:
-        raise ConfigError([f"parameter file '{path}' is not YAML ({error})"]) from error
+    except InputError as error:
+        raise ConfigError([f"parameter file '{path}' {error}"]) from error
     if not isinstance(document, Mapping):
-        raise ConfigError([f"parameter file '{path}' holds '{document}', expected sections like '/**/frontend_node:'"])
+        raise ConfigError([f"parameter file '{path}' holds '{str(document)[:60]}', expected sections like '/**/frontend_node:'"])
     values: dict[str, Any] = {}
     for name, content in document.items():
         values.update(_node_parameters(str(name), content))
@@ -124,10 +101,6 @@ def _node_parameters(name: str, content: Any) -> dict[str, Any]:
     known = {spec.name for spec in parameters(Settings)}
     flat = flatten(content[_PARAMETERS] or {}, prefix)
     return {key: value for key, value in flat.items() if key in known or key.removeprefix(prefix) not in NODE_ONLY}
-
-
-def _load(text: str) -> Any:
-    return yaml.load(text, _Loader)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ import dataclasses
 import difflib
 import math
 import typing
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any, TypeVar
@@ -21,6 +21,9 @@ from typing import Any, TypeVar
 from vli_common.errors import ConfigError
 
 T = TypeVar("T")
+
+_LARGEST = 2**1023
+"""An integer beyond has no float."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +43,7 @@ class ParameterSpec:
         """Return what is wrong with ``value``, or None."""
         wanted = {float: "a number", int: "an integer", bool: "true or false", str: "a string"}[self.kind]
         if self.kind is float and isinstance(value, int) and not isinstance(value, bool):
-            value = float(value)
+            value = float(value) if abs(value) < _LARGEST else math.inf
         if not isinstance(value, self.kind) or (self.kind is int and isinstance(value, bool)):
             return f"'{self.name}' is '{value}', expected {wanted}"
         if isinstance(value, float) and not math.isfinite(value):
@@ -105,15 +108,20 @@ def flatten(mapping: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def from_mapping(config_type: type[T], mapping: Mapping[str, Any]) -> T:
+def from_mapping(config_type: type[T], mapping: Mapping[str, Any], problems: Sequence[str] = ()) -> T:
     """Build a config from (nested or dotted) names; missing ones keep their defaults.
+
+    Args:
+        config_type: the dataclass.
+        mapping: names and values.
+        problems: that were found while reading them, to be told with those found here.
 
     Raises:
         ConfigError: unknown names (with the nearest valid one) and invalid values, all at once.
     """
     specs = {spec.name: spec for spec in parameters(config_type)}
     flat = flatten(mapping)
-    problems = [unknown_key(name, specs) for name in flat if name not in specs]
+    problems = [*problems, *(unknown_key(name, specs) for name in flat if name not in specs)]
     for name, value in flat.items():
         if name in specs and (problem := specs[name].problem(value)):
             problems.append(problem)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import heapq
 import itertools
 from collections import deque
@@ -98,10 +99,13 @@ class BagReader:
         first = next(self._raw({self.camera_info_topic}), None)
         return None if first is None else cdr.read_any(first.data, cdr.CAMERA_INFO)
 
-    def first_image(self) -> EncodedImage | None:
-        """Return the first image of the bag, for checks before a run."""
-        first = next(self._raw({self.image_topic}), None)
-        return None if first is None else cdr.read_image(first.data, self.topics[self.image_topic].msgtype)
+    def images(self) -> Iterator[EncodedImage]:
+        """Yield the images alone, without exposure notes and without counting what is malformed; for checks before a run."""
+        msgtype = self.topics[self.image_topic].msgtype
+        for message in self._selected():
+            if message.topic == self.image_topic:
+                with contextlib.suppress(MessageError):
+                    yield cdr.read_image(message.data, msgtype)
 
     def __iter__(self) -> Iterator[EncodedImage | ImuSample]:
         joiner = ExposureJoiner() if self.exposure_topic else None
@@ -237,7 +241,10 @@ class BagReader:
 
     def _missing(self, kind: str, name: str) -> InputError:
         there = ", ".join(f"{topic} ({info.msgtype})" for topic, info in sorted(self.topics.items())) or "no topics at all"
-        return InputError(f"'{self.path}' has no {kind} topic '{name}'; it has {there}; choose one with --topic {kind}=/name")
+        without = " or run without it: --mode vl" if kind == "imu" else ""
+        return InputError(
+            f"'{self.path}' has no {kind} topic '{name}'; it has {there}; choose one with --topic {kind}=/name{without}"
+        )
 
     def _collect_warnings(self) -> None:
         for file in self.files:

@@ -31,6 +31,7 @@ def replacing(path: Path) -> Iterator[Path]:
     """
     # The ending stays: libraries choose the format by it.
     partial = path.with_name(f"{path.name}.partial{path.suffix}")
+    check_place(path)
     try:
         yield partial
         os.replace(partial, path)
@@ -38,6 +39,21 @@ def replacing(path: Path) -> Iterator[Path]:
         raise OutputError(f"'{path}' cannot be written: {error.strerror or error}") from error
     finally:
         _remove(partial)
+
+
+def check_place(path: Path) -> None:
+    """Raise, before anything is computed, where a file cannot be written to ``path``.
+
+    Raises:
+        OutputError: its directory is not there, or it is one itself.
+    """
+    try:
+        if path.is_dir():
+            raise OutputError(f"'{path}' is a directory, expected the file to write")
+        if not path.parent.is_dir():
+            raise OutputError(f"'{path}' cannot be written: there is no directory '{path.parent}'; make it first")
+    except OSError as error:
+        raise OutputError(f"'{path}' cannot be written: {error.strerror or error}") from error
 
 
 def _remove(path: Path) -> None:

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
-import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
-import yaml
-
-from vli_common.errors import OutputError
-from vli_simulation.config import SimulationError
+from vli_common.directories import NewDirectory
+from vli_common.errors import ConfigError
+from vli_common.yaml_text import parse_assignments
+from vli_simulation.config import RECORD, SimulationError
 
 Flag: TypeAlias = tuple[str, str, type, str]
 """A flag, the dotted parameter it sets, the type of its value, and its help."""
@@ -32,7 +30,7 @@ SENSOR_FLAGS: tuple[Flag, ...] = (
 def add_output_arguments(parser: argparse.ArgumentParser) -> None:
     """Add where to write, the seed and the number of threads."""
     parser.add_argument("--out", type=Path, required=True, help="directory to write; refused where it has content")
-    parser.add_argument("--overwrite", action="store_true", help="replace an existing directory")
+    parser.add_argument("--overwrite", action="store_true", help="replace what the same command has written there")
     parser.add_argument("--seed", type=int, default=0, help="of everything that is random; same seed, same recording")
     parser.add_argument("--workers", type=int, default=None, help="threads; the result does not depend on it")
 
@@ -40,7 +38,7 @@ def add_output_arguments(parser: argparse.ArgumentParser) -> None:
 def add_flags(parser: argparse.ArgumentParser, flags: Sequence[Flag]) -> None:
     """Add flags that set parameters, and ``--set`` for all the others."""
     parser.add_argument("--no-rest", action="store_true", help="starts in full motion")
-    parser.add_argument("--resolution", metavar="WxH", help="pixels, e.g. 640x480")
+    parser.add_argument("--resolution", metavar="WxH", type=_resolution, help="pixels, e.g. 640x480")
     parser.add_argument("--exposure-topic", action="store_true", help="also write /camera/exposure")
     for flag, name, kind, text in flags:
         parser.add_argument(flag, type=kind, dest=name, metavar="V", help=text)
@@ -48,46 +46,41 @@ def add_flags(parser: argparse.ArgumentParser, flags: Sequence[Flag]) -> None:
 
 
 def overrides(args: argparse.Namespace, flags: Sequence[Flag]) -> dict[str, Any]:
-    """Return dotted parameters from ``flags`` and ``--set``."""
+    """Return dotted parameters from ``flags`` and ``--set``.
+
+    Raises:
+        ConfigError: ``--set`` without a value, or one that is not YAML.
+    """
     given = {name: getattr(args, name) for _, name, _, _ in flags if getattr(args, name) is not None}
     if args.no_rest:
         given["motion.rest_s"] = 0.0
     if args.exposure_topic:
         given["exposure_topic"] = True
     if args.resolution:
-        width, _, height = args.resolution.partition("x")
-        given["rig.width"], given["rig.height"] = yaml.safe_load(width), yaml.safe_load(height)
-    for item in args.set:
-        key, _, value = item.partition("=")
-        given[key] = yaml.safe_load(value)
-    return given
+        given["rig.width"], given["rig.height"] = args.resolution
+    assigned, problems = parse_assignments(args.set, "sensor.speckle=0.4")
+    if problems:
+        raise ConfigError(problems)
+    return given | assigned
 
 
-def check_output(args: argparse.Namespace) -> None:
-    """Check what :func:`add_output_arguments` added.
+def new_directory(args: argparse.Namespace) -> NewDirectory:
+    """Return the directory that :func:`add_output_arguments` asks for, made when it is entered.
 
     Raises:
-        OutputError: the directory exists and has content.
+        OutputError: the directory exists and has content, or is none.
         SimulationError: seed or number of threads is impossible.
     """
     if args.seed < 0 or (args.workers is not None and args.workers < 1):
         raise SimulationError(
             f"--seed '{args.seed}' or --workers '{args.workers}' is out of range, expected at least 0 and at least 1"
         )
-    out = args.out
-    if out.exists() and (not out.is_dir() or any(out.iterdir())) and not args.overwrite:
-        raise OutputError(f"'{out}' exists and is not empty; choose another --out or add --overwrite")
+    return NewDirectory(args.out, RECORD, args.overwrite)
 
 
-@contextlib.contextmanager
-def new_directory(out: Path) -> Iterator[Path]:
-    """Yield the empty directory ``OUT.partial``, which takes the place of ``out`` when all has gone well."""
-    partial = out.with_name(out.name + ".partial")
-    if partial.exists():
-        # Left there by an interrupted run.
-        shutil.rmtree(partial)
-    partial.mkdir(parents=True)
-    yield partial
-    if out.exists():
-        shutil.rmtree(out)
-    partial.rename(out)
+def _resolution(text: str) -> tuple[int, int]:
+    width, _, height = text.partition("x")
+    try:
+        return int(width), int(height)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"'{text}', expected WxH in pixels, e.g. 640x480") from None

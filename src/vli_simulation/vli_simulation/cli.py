@@ -8,7 +8,7 @@ import time
 
 from tqdm import tqdm
 
-from vli_simulation.arguments import SENSOR_FLAGS, Flag, add_flags, add_output_arguments, check_output, new_directory, overrides
+from vli_simulation.arguments import SENSOR_FLAGS, Flag, add_flags, add_output_arguments, new_directory, overrides
 from vli_simulation.board import cli as board
 from vli_simulation.config import PRESETS, make_config
 from vli_simulation.scenes import SCENES
@@ -56,10 +56,10 @@ def _add_scene_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _run_scene(args: argparse.Namespace) -> int:
     config = make_config(args.preset, overrides(args, _FLAGS))
-    check_output(args)
+    directory = new_directory(args)
     start = time.monotonic()
     simulation = Simulation(args.scene, config, args.seed)
-    with new_directory(args.out) as partial, tqdm(total=len(simulation), unit="frame", disable=None, file=sys.stderr) as bar:
+    with directory as partial, tqdm(total=len(simulation), unit="frame", disable=None, file=sys.stderr) as bar:
         write_recording(simulation, partial, args.workers, bar.update)
     wall = time.monotonic() - start
     rate = len(simulation) / wall

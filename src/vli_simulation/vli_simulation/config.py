@@ -115,6 +115,9 @@ class SimulationConfig:
     exposure_topic: bool = parameter(False, doc="also write /camera/exposure")
 
 
+RECORD = "simulation.yaml"
+"""File with what was asked for, in every directory that the simulator writes."""
+
 PRESETS: dict[str, dict[str, Any]] = {
     "smoke": {"motion.duration_s": 5.0, "motion.passes": 1},
     "short": {"motion.duration_s": 25.0, "motion.passes": 2},

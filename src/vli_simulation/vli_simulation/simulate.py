@@ -13,7 +13,7 @@ import yaml
 from vli_common.arrays import AnyArray, FloatArray, IntArray
 from vli_common.calibration import to_yaml
 from vli_common.types import NANOSECONDS
-from vli_simulation.config import SimulationConfig, to_document
+from vli_simulation.config import RECORD, SimulationConfig, to_document
 from vli_simulation.imu import ImuRecording, record_imu
 from vli_simulation.motion import Motion, plan_motion
 from vli_simulation.parallel import in_order, single_threaded_opencv
@@ -133,9 +133,7 @@ def write_recording(
         progress: called with the number of frames done since the last call.
     """
     (out / "calibration.yaml").write_text(to_yaml(simulation.rig.document))
-    (out / "simulation.yaml").write_text(
-        yaml.safe_dump({"seed": simulation.seed, **to_document(simulation.config)}, sort_keys=False)
-    )
+    (out / RECORD).write_text(yaml.safe_dump({"seed": simulation.seed, **to_document(simulation.config)}, sort_keys=False))
     write_tum(out / "truth.tum", (int(stamp) for stamp in simulation.stamps_ns), simulation.poses)
     start_s = simulation.config.start_s
     passes = [(start_s + start, start_s + end) for start, end in simulation.motion.passes]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import pytest
 
@@ -77,6 +78,25 @@ def test_a_place_that_cannot_be_made_is_one_line(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(OutputError, match=r"cannot be made .*--out DIR"), ResultsDirectory(tmp_path / "file" / "out"):
         pytest.fail("entered")
+
+
+@pytest.mark.parametrize("name", ["", ".", "/", "..", "a/.."])
+def test_what_has_no_name_of_its_own_is_no_place(name):
+    with pytest.raises(OutputError, match="is no name for a new directory; choose another with --out DIR"):
+        ResultsDirectory(Path(name), overwrite=True)
+
+
+def test_a_name_that_is_too_long_is_one_line():
+    with pytest.raises(OutputError, match=r"cannot be looked at \(File name too long\); choose another with --out DIR"):
+        ResultsDirectory(Path("x" * 300))
+
+
+def test_a_link_is_refused_before_anything_is_computed(tmp_path):
+    (tmp_path / "old").mkdir()
+    fill(tmp_path / "old")
+    (tmp_path / "latest").symlink_to("old")
+    with pytest.raises(OutputError, match="is a link, expected a directory"):
+        ResultsDirectory(tmp_path / "latest", overwrite=True)
 
 
 def test_a_write_that_fails_is_said_as_such_and_leaves_nothing(tmp_path):

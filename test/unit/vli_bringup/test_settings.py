@@ -84,6 +84,14 @@ def test_all_wrong_assignments_are_said_at_once():
     assert len(error.value.problems) == 3
 
 
+@pytest.mark.parametrize("value", ["[1", "*x", "!!python/object:os.system 1", "1" * 400, "", "{a: 1}"])
+def test_a_value_that_is_none_is_one_error(value):
+    with pytest.raises(ConfigError, match=r"backend.window_keyframes"):
+        load_settings(assignments=[f"backend.window_keyframes={value}", "backend.window_keyframes=1"])
+    with pytest.raises(ConfigError, match=r"demux.min_ratio"):
+        load_settings(assignments=[f"demux.min_ratio={value}"])
+
+
 def test_what_concerns_nodes_only_may_stand_in_the_file_and_is_passed_over(tmp_path):
     text = "/**/demux_node: {ros__parameters: {image_topic: /front, mode: vi, demux.min_ratio: 2.5}}\n"
     text += "/**/driver_node: {ros__parameters: {image_topic: /front, rate: 0.5}}\n"

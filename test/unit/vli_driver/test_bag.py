@@ -155,7 +155,7 @@ def test_a_compressed_stream_serves_where_there_is_no_raw_one(tmp_path: Path) ->
         (rec.START_NS, "/imu", rec.imu(rec.START_NS)),
     ]
     reader = BagReader(rec.write_mcap(tmp_path / "a.mcap", messages))
-    image = reader.first_image()
+    image = next(reader.images())
     assert image is not None
     assert (image.compressed, image.encoding, image.data[:2]) == (True, "jpeg", b"\xff\xd8")
 

@@ -126,7 +126,7 @@ def test_seen_points_are_thinned_to_one_in_a_cube() -> None:
 
 def test_an_existing_directory_is_kept_unless_told_otherwise(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("precious")
-    with pytest.raises(OutputError, match=r"exists and is not empty; choose another --out or add --overwrite"):
+    with pytest.raises(OutputError, match=r"is not empty; choose another with --out DIR, or replace it with --overwrite"):
         _run("keyboard", "--out", str(tmp_path), *TINY)
     assert (tmp_path / "mine.txt").read_text() == "precious"
 
@@ -137,7 +137,7 @@ def test_an_existing_directory_is_kept_unless_told_otherwise(tmp_path: Path) -> 
         (("--lens", "fisheye"), ConfigError, "'rig.lens' is 'fisheye', expected one of radtan, equidistant, none"),
         (("--set", "sensor.specle=1"), ConfigError, "unknown parameter 'sensor.specle', did you mean 'sensor.speckle'"),
         (("--distance", "0.5"), ConfigError, "'motion.distance' is '0.5', expected 0.015 to 0.15 m"),
-        (("--resolution", "640"), ConfigError, "'rig.height' is 'None', expected an integer"),
+        (("--set", "sensor.quality=["), ConfigError, r"--set sensor.quality=\[. is not YAML"),
         (("--seed", "-1"), SimulationError, "--seed '-1' or --workers 'None' is out of range"),
         (("--duration", "60"), SimulationError, "is longer than the scene"),
     ],

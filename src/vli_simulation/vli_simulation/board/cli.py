@@ -9,7 +9,7 @@ import time
 from tqdm import tqdm
 
 from vli_calibration.targets import FORMS, parse_target
-from vli_simulation.arguments import SENSOR_FLAGS, Flag, add_flags, add_output_arguments, check_output, new_directory, overrides
+from vli_simulation.arguments import SENSOR_FLAGS, Flag, add_flags, add_output_arguments, new_directory, overrides
 from vli_simulation.board.config import make_board_config
 from vli_simulation.board.parts import PARTS, write_truth
 from vli_simulation.board.simulate import BoardSimulation
@@ -66,12 +66,12 @@ def run(args: argparse.Namespace) -> int:
     switched = {name: value for flag, name, value, _ in _SWITCHES if getattr(args, flag[2:].replace("-", "_"))}
     config = make_board_config({**switched, **overrides(args, _FLAGS)})
     target = parse_target(args.target)
-    check_output(args)
+    directory = new_directory(args)
     start = time.monotonic()
     simulation = BoardSimulation(target, config, args.seed)
     parts = {name: PARTS[name](simulation) for name in PARTS if name in args.parts}
     truth = []
-    with new_directory(args.out) as partial:
+    with directory as partial:
         for name, part in parts.items():
             with tqdm(total=len(part), desc=name, disable=None, file=sys.stderr) as bar:
                 truth.append(part.write(partial, args.workers, bar.update))

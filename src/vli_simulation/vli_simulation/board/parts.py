@@ -12,7 +12,7 @@ from vli_common.calibration import to_yaml
 from vli_simulation.board.recordings import MovingBoard, write_moving_board, write_rest
 from vli_simulation.board.simulate import BoardSimulation
 from vli_simulation.board.stills import POSES_FILE, camera_stills, laser_stills, write_arm_poses, write_stills
-from vli_simulation.config import to_document
+from vli_simulation.config import RECORD, to_document
 
 Progress = Callable[[int], object]
 
@@ -111,4 +111,4 @@ def write_truth(simulation: BoardSimulation, truth: list[dict[str, Any]], out: P
         document |= part
     (out / "truth.yaml").write_text(to_yaml(document))
     settings = {"seed": simulation.seed, "target": simulation.target.spec, **to_document(simulation.config)}
-    (out / "simulation.yaml").write_text(yaml.safe_dump(settings, sort_keys=False))
+    (out / RECORD).write_text(yaml.safe_dump(settings, sort_keys=False))
