@@ -18,7 +18,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 
 from vli_backend.condense import Quadratic
-from vli_common.arrays import FloatArray
+from vli_common.arrays import FloatArray, IntArray
 from vli_common.errors import VliError
 
 _UNMEASURED_WALK = (1e-2, 1e-3)
@@ -238,10 +238,9 @@ class GtsamSmoother:
         h, g = quadratic.hessian[6 * skip :, 6 * skip :], -quadratic.gradient[6 * skip :]
         blocks = gtsam.GaussianFactorGraph()
         constant = quadratic.constant
-        for poses, carries in _cover(len(keys)):
-            rows = (6 * np.array(poses)[:, None] + np.arange(6)).ravel()
-            part = h[np.ix_(rows, rows)] * carries
-            blocks.push_back(_hessian([keys[i] for i in poses], part, g[rows] * carries.diagonal(), constant))
+        for group in _cover(len(keys)):
+            part = h[group.rows[:, None], group.rows] * group.carries
+            blocks.push_back(_hessian([keys[i] for i in group.poses], part, g[group.rows] * group.carries_gradient, constant))
             constant = 0.0
         point = gtsam.Values()
         for key in keys:
@@ -276,17 +275,29 @@ class GtsamSmoother:
             raise SmootherError(_first_line(error)) from error
 
 
+@dataclass(frozen=True)
+class _Group:
+    """Up to three poses: their (6n,) rows of the whole quadratic, and what of it they carry, (6n, 6n) and (6n,), 0 or 1."""
+
+    poses: tuple[int, ...]
+    rows: IntArray
+    carries: FloatArray
+    carries_gradient: FloatArray
+
+
 @functools.cache
-def _cover(count: int) -> tuple[tuple[tuple[int, ...], FloatArray], ...]:
-    """Return groups of up to three of ``count`` poses that hold every pair, and which blocks each carries: (6n, 6n), 0 or 1."""
+def _cover(count: int) -> tuple[_Group, ...]:
+    """Return groups of ``count`` poses that hold every pair once."""
     missing = {(i, j) for i in range(count) for j in range(i, count)}
     groups = []
     while missing:
         group = max(itertools.combinations(range(count), min(count, 3)), key=lambda item: len(_pairs(item) & missing))
         fresh = _pairs(group) & missing
         missing -= fresh
-        carries = np.array([[float((min(i, j), max(i, j)) in fresh) for j in group] for i in group])
-        groups.append((group, np.kron(carries, np.ones((6, 6)))))
+        carried = np.array([[float((min(i, j), max(i, j)) in fresh) for j in group] for i in group])
+        carries = np.kron(carried, np.ones((6, 6)))
+        rows = (6 * np.array(group)[:, None] + np.arange(6)).ravel()
+        groups.append(_Group(group, rows, carries, carries.diagonal().copy()))
     return tuple(groups)
 
 
