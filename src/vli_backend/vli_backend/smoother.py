@@ -230,22 +230,13 @@ class GtsamSmoother:
         return np.stack([self._estimate.atPose3(X(k)).matrix() for k in range(self._first, self._first + self._count)])
 
     def _to_container(self, quadratic: Quadratic, skip: int = 0) -> gtsam.LinearContainerFactor:
-        """Return the quadratic, without its ``skip`` oldest poses, as one factor.
-
-        It is summed up from factors of three poses: from Python GTSAM takes no larger one.
-        """
+        """Return the quadratic, without its ``skip`` oldest poses, as one factor."""
         keys = [X(k) for k in range(self._first + skip, self._first + self._count)]
         h, g = quadratic.hessian[6 * skip :, 6 * skip :], -quadratic.gradient[6 * skip :]
-        blocks = gtsam.GaussianFactorGraph()
-        constant = quadratic.constant
-        for group in _cover(len(keys)):
-            part = h[group.rows[:, None], group.rows] * group.carries
-            blocks.push_back(_hessian([keys[i] for i in group.poses], part, g[group.rows] * group.carries_gradient, constant))
-            constant = 0.0
         point = gtsam.Values()
         for key in keys:
             point.insert(key, self._estimate.atPose3(key))
-        return gtsam.LinearContainerFactor(gtsam.HessianFactor(blocks), point)
+        return gtsam.LinearContainerFactor(sum_of_small_factors(keys, h, g, quadratic.constant), point)
 
     def _replace(self, container: gtsam.LinearContainerFactor) -> None:
         self._new_factors.add(container)
@@ -273,6 +264,19 @@ class GtsamSmoother:
             self._estimate = self._smoother.calculateEstimate()
         except (RuntimeError, ValueError) as error:
             raise SmootherError(_first_line(error)) from error
+
+
+def sum_of_small_factors(keys: list[int], h: FloatArray, g: FloatArray, f: float) -> gtsam.HessianFactor:
+    """Return the factor ½ δᵀ h δ − gᵀ δ + ½ f of any number of poses; h (6n, 6n), g (6n,).
+
+    It is summed up from factors of three poses: from Python GTSAM takes no larger one.
+    """
+    blocks = gtsam.GaussianFactorGraph()
+    for group in _cover(len(keys)):
+        part = h[group.rows[:, None], group.rows] * group.carries
+        blocks.push_back(_hessian([keys[i] for i in group.poses], part, g[group.rows] * group.carries_gradient, f))
+        f = 0.0
+    return gtsam.HessianFactor(blocks)
 
 
 @dataclass(frozen=True)
