@@ -1,4 +1,4 @@
-"""Bad input to ``vli run``: one line that says what to do, exit code 2, and nothing left behind."""
+"""Bad input to the commands: one line that says what to do, exit code 2, and nothing left behind."""
 
 from __future__ import annotations
 
@@ -62,7 +62,9 @@ def test_a_bag_without_the_topics_lists_what_is_there(refused, calibration, tmp_
 
 def test_a_bag_without_an_imu_names_the_option(refused, calibration, tmp_path):
     bag = TinyBag(imu_topics=()).write(tmp_path / "bag")
-    assert "has no imu topic '/imu'" in refused(bag, calibration)
+    line = refused(bag, calibration)
+    assert "has no imu topic '/imu'" in line
+    assert "choose one with --topic imu=/name or run without it: --mode vl" in line
 
 
 def test_two_cameras_say_which_to_pick(refused, calibration, tmp_path):
@@ -153,6 +155,78 @@ def test_a_topic_that_is_not_there(refused, good_bag, calibration):
     assert "no image topic '/front/image'" in refused(good_bag, calibration, "--topic", "image=/front/image")
 
 
+def test_a_part_that_lies_beyond_the_end(refused, good_bag, calibration):
+    line = refused(good_bag, calibration, "--start", "1e9")
+    assert "that is asked for holds no image, the bag has '2.0' s; choose another with --start and --duration" in line
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "said"),
+    [
+        ("--start", "soon", "'soon', expected seconds, 0 or more"),
+        ("--start", "-1", "'-1', expected seconds, 0 or more"),
+        ("--duration", "0", "'0', expected seconds, more than 0"),
+        ("--duration", "-1", "'-1', expected seconds, more than 0"),
+        ("--topic", "imu", "'imu', expected one of image=/name, imu=/name"),
+        ("--speed", "2", "unrecognized arguments: --speed 2"),
+    ],
+)
+def test_a_value_that_an_option_cannot_have(good_bag, calibration, tmp_path, capsys, option, value, said):
+    with pytest.raises(SystemExit) as error:
+        main(["run", str(good_bag), "--calib", str(calibration), "--out", str(tmp_path / "out"), option, value])
+    line = capsys.readouterr().err
+    assert error.value.code == 2
+    assert line.count("\n") == 1
+    assert said in line
+    assert line.endswith("see 'vli run --help'\n")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["scan ü 扫描", "a/b c/d"])
+def test_any_name_will_do(good_bag, tmp_path, capsys, name):
+    place = tmp_path / name
+    place.mkdir(parents=True)
+    bag = place / "bäg"
+    bag.symlink_to(good_bag)
+    calibration = write_calibration(place / "cal ib.yaml")
+    out = place / "new" / "out put"
+    assert main(["run", str(bag), "--calib", str(calibration), "--out", str(out), "--duration", "0.3"]) == 1
+    assert capsys.readouterr().err.startswith("vli run: tracking never started in ")
+    assert (out / "summary.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        (("run", "BAG", "--calib", "CALIB", "--out", "."), "'.' is no name for a new directory"),
+        (("run", "BAG", "--calib", "CALIB", "--out", "file/out"), "'file/out.partial' cannot be made (Not a directory)"),
+        (("simulate", "keyboard", "--out", "thesis"), "'thesis' is not empty"),
+        (("simulate", "keyboard", "--out", "thesis", "--overwrite"), "'thesis' holds 'thesis.tex' but no 'simulation.yaml'"),
+        (("simulate", "board", "--out", "thesis", "--overwrite"), "'thesis' holds 'thesis.tex' but no 'simulation.yaml'"),
+        (("simulate", "keyboard", "--out", "file", "--overwrite"), "'file' is a file, expected a directory"),
+        (("export", "thesis", "--out", "absent/map.ply"), "there is no directory 'absent'; make it first"),
+        (("export", "thesis", "--out", "map.ply"), "'thesis/map.vli' cannot be read"),
+        (("merge", "file", "file", "--out", "absent/map.vli"), "there is no directory 'absent'; make it first"),
+        (("doctor", "--live", "--start", "3"), "--start is '3', which is of a bag"),
+        (("doctor", "BAG", "--start", "99"), "holds no image, the bag has '2.0' s"),
+        (("eval", "thesis", "--truth", "file"), "'thesis' holds no 'trajectory.tum'"),
+    ],
+)
+def test_a_place_that_cannot_be_used_is_left_as_it_is(good_bag, tmp_path, capsys, monkeypatch, command, said):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("precious")
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "thesis.tex").write_text("precious")
+    write_calibration(tmp_path / "calibration.yaml")
+    before = {path: path.is_file() and path.read_text() for path in tmp_path.rglob("*")}
+    arguments = [{"BAG": str(good_bag), "CALIB": "calibration.yaml"}.get(word, word) for word in command]
+    assert main(arguments) == 2
+    captured = capsys.readouterr()
+    assert (captured.out, captured.err.count("\n")) == ("", 1)
+    assert said in captured.err
+    assert {path: path.is_file() and path.read_text() for path in tmp_path.rglob("*")} == before
+
+
 def test_an_output_that_holds_something(good_bag, calibration, tmp_path, capsys):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "thesis.tex").touch()
@@ -182,3 +256,14 @@ def test_images_that_are_none_are_left_out_and_counted(calibration, tmp_path, ca
     bag = TinyBag(broken_images=0.1).write(tmp_path / "bag")
     assert main(["run", str(bag), "--calib", str(calibration), "--out", str(tmp_path / "out")]) in (0, 1)
     assert "warning: 12 undecodable images were left out" in capsys.readouterr().err
+
+
+def test_a_first_image_that_is_none_does_not_speak_against_the_others(calibration, tmp_path, capsys):
+    bag = TinyBag(broken_first=3, seconds=0.5).write(tmp_path / "bag")
+    assert main(["run", str(bag), "--calib", str(calibration), "--out", str(tmp_path / "out")]) == 1
+    assert "warning: 3 undecodable images were left out" in capsys.readouterr().err
+
+
+def test_a_bag_whose_images_are_none_is_refused(refused, calibration, tmp_path):
+    bag = TinyBag(broken_first=60, seconds=0.5).write(tmp_path / "bag")
+    assert "compressed image of format 'jpeg' starts with '00000000', expected a jpeg or a png" in refused(bag, calibration)

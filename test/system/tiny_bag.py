@@ -66,6 +66,7 @@ class TinyBag:
         size: width, height.
         seconds: length.
         broken_images: share of the images, evenly spread, that are no images.
+        broken_first: how many at the beginning are none.
         others: topic → text of one String message.
     """
 
@@ -79,6 +80,7 @@ class TinyBag:
     size: tuple[int, int] = (160, 120)
     seconds: float = 2.0
     broken_images: float = 0.0
+    broken_first: int = 0
     others: dict[str, str] = field(default_factory=dict)
 
     def write(self, path: Path) -> Path:
@@ -101,7 +103,8 @@ class TinyBag:
         jpegs = [np.asarray(cv2.imencode(".jpg", (texture * gain).astype(np.uint8))[1]).ravel() for gain in (0.9, 0.05)]
         stamps = START_NS + np.arange(round(60 * self.seconds)) * NS // 60
         every = round(1 / self.broken_images) if self.broken_images else len(stamps) + 1
-        data = [jpegs[index % 2] if (index + 1) % every else np.zeros(9, np.uint8) for index in range(len(stamps))]
+        broken = [index < self.broken_first or not (index + 1) % every for index in range(len(stamps))]
+        data = [np.zeros(9, np.uint8) if broken[index] else jpegs[index % 2] for index in range(len(stamps))]
         return [
             (topic, int(stamp), kind(header(self.image_stamp(int(stamp))), "jpeg", bytes_))
             for topic in self.image_topics
