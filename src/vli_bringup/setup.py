@@ -30,12 +30,15 @@ setup(
         "vli_calibration==0.1.0",
         "vli_simulation==0.1.0",
         "matplotlib>=3.6",
+        "mcap>=1.6",
         "numpy>=1.26",
         "opencv-python-headless>=4.6,<5",
         "PyYAML>=6.0",
+        "rosbags>=0.11",
         "scipy>=1.11",
         "tqdm>=4.64",
     ],
+    extras_require={"view": ["viser>=1.0"]},
     zip_safe=False,
     entry_points={
         "console_scripts": [

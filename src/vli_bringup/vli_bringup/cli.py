@@ -19,6 +19,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "replay": ("vli_bringup.replay", "a bag through the node graph, at the bag's pace"),
     "simulate": ("vli_simulation.cli", "make a bag with truth"),
     "calibrate": ("vli_calibration.cli", "camera, laser plane, IMU: make a calibration and say what it is worth"),
+    "record": ("vli_bringup.record", "what the scanner sends, to a bag"),
     "doctor": ("vli_bringup.doctor", "is a bag, or a live sensor, fit for a scan? say what to change"),
     "export": ("vli_bringup.export", "a map to a cloud (.ply .pcd .las .laz .e57) or a mesh (.stl .obj .glb, .ply with --mesh)"),
     "merge": ("vli_bringup.merge", "several saved maps that overlap, aligned, to one"),
@@ -47,7 +48,7 @@ def make_parser(command: str | None) -> argparse.ArgumentParser:
         if name == command:
             implementation = importlib.import_module(module)
             implementation.add_arguments(subparser)
-            subparser.set_defaults(run=implementation.run)
+            subparser.set_defaults(run=implementation.run, parser=subparser)
     return parser
 
 
@@ -60,7 +61,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
         command = next((item for item in arguments if not item.startswith("-")), None)
-        args = make_parser(command).parse_args(arguments, argparse.Namespace(started_s=started_s))
+        args, unknown = make_parser(command).parse_known_args(arguments, argparse.Namespace(started_s=started_s))
+        if unknown:
+            args.parser.error(f"unrecognized arguments: {' '.join(unknown)}")
         code: int = args.run(args)
         sys.stdout.flush()
         return code

@@ -1,0 +1,35 @@
+"""Where a recording goes: ``DIR.partial`` while it lasts, ``DIR`` when it has ended."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import TracebackType
+
+from vli_common.directories import NewDirectory
+from vli_common.errors import OutputError, VliError
+
+
+class RecordingDirectory(NewDirectory):
+    """Context manager: a crash leaves ``DIR.partial``, which is read as it is and never replaced unasked.
+
+    Args:
+        out: its name in the end.
+        overwrite: True lets a recording of that name be replaced, the rest of one that was cut off too.
+
+    Raises:
+        OutputError: there is something already, or the directory cannot be made.
+    """
+
+    def __init__(self, out: Path, overwrite: bool) -> None:
+        marker = f"{out.name}_0.mcap"
+        super().__init__(out, marker, overwrite)
+        if not overwrite and (self.partial / marker).exists():
+            raise OutputError(
+                f"'{self.partial}' holds a recording that was cut off, which every command reads as it is; rename it, choose "
+                "another with --out DIR, or replace it with --overwrite"
+            )
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        """Give the recording its name; one that is known to hold nothing is removed, one that something broke stays as it is."""
+        if kind is None or issubclass(kind, VliError):
+            super().__exit__(kind, error, trace)
