@@ -137,6 +137,7 @@ class _Problem:
     weights: FloatArray
 
     def without(self, index: int) -> _Problem:
+        """Return the problem without one of its views."""
         rest = [i for i in range(len(self.views)) if i != index]
         state = BundleState(self.state.parameters, self.state.poses[rest])
         return _Problem(
@@ -149,12 +150,14 @@ class _Problem:
         )
 
     def weighted(self) -> list[Observation]:
+        """Return the observations with their weights, zero where a corner was left out."""
         return [
             Observation(seen.points, seen.pixels, weight * kept)
             for seen, kept, weight in zip(self.observations, self.kept, self.weights, strict=True)
         ]
 
     def errors(self) -> list[FloatArray]:
+        """Return the residuals (n, 2) of each view in pixels."""
         return residuals(self.lens, self.state, self.observations)
 
 

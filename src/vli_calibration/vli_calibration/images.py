@@ -43,6 +43,7 @@ class _Source:
     stripe: Path | None = None
 
     def files(self) -> list[Path]:
+        """Return the file, or both of a pair."""
         return [self.board] if self.stripe is None else [self.board, self.stripe]
 
 

@@ -83,6 +83,7 @@ class StampedBuffer(Generic[T]):
         return len(self._stamps)
 
     def __iter__(self) -> Iterator[T]:
+        """Yield the items, the oldest first."""
         return iter(self._items)
 
     @property

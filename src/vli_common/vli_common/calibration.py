@@ -150,9 +150,11 @@ class _Dumper(yaml.SafeDumper):
     """Writes a list of scalars on one line, as Kalibr does, and never an anchor."""
 
     def ignore_aliases(self, data: Any) -> bool:
+        """Never refer back, whatever occurs twice."""
         return True
 
     def represent_sequence(self, tag: str, sequence: Any, flow_style: bool | None = None) -> yaml.SequenceNode:
+        """Write what holds no containers on one line."""
         flat = not any(isinstance(item, list | dict) for item in sequence)
         return super().represent_sequence(tag, sequence, flow_style=flat)
 

@@ -28,6 +28,7 @@ class Range:
         return self.minimum <= value <= self.maximum
 
     def __str__(self) -> str:
+        """Return the limits and their unit."""
         return f"{self.minimum:g} to {self.maximum:g} {self.unit}"
 
 

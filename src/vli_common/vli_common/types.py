@@ -352,4 +352,5 @@ class Counters:
             self.values[name] = self.values.get(name, 0) + count
 
     def __getitem__(self, name: str) -> int:
+        """Return a count, 0 for what never occurred."""
         return self.values.get(name, 0)

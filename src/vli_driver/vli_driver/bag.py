@@ -108,6 +108,7 @@ class BagReader:
                     yield cdr.read_image(message.data, msgtype)
 
     def __iter__(self) -> Iterator[EncodedImage | ImuSample]:
+        """Yield images and IMU samples in log order; what is malformed is dropped, counted, and told once."""
         joiner = ExposureJoiner() if self.exposure_topic else None
         for message in self._selected():
             item = self._read(message)

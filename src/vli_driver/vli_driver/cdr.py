@@ -53,6 +53,7 @@ class _Cursor:
         self.offset = 0
 
     def number(self, code: str) -> Any:
+        """Read one number of a struct code, aligned to its size."""
         size = struct.calcsize(code)
         self.align(size)
         (value,) = struct.unpack_from(self.order + code, self.data, self.offset)
@@ -60,9 +61,11 @@ class _Cursor:
         return value
 
     def align(self, size: int) -> None:
+        """Go on to a multiple of ``size``."""
         self.offset += -self.offset % size
 
     def raw(self) -> bytes:
+        """Read a sequence of octets."""
         length = self.number("I")
         start, self.offset = self.offset, self.offset + length
         if self.offset > len(self.data):
@@ -70,6 +73,7 @@ class _Cursor:
         return bytes(self.data[start : self.offset])
 
     def text(self) -> str:
+        """Read a string."""
         return self.raw().rstrip(b"\0").decode(errors="replace")
 
     def stamp(self) -> int:

@@ -29,6 +29,7 @@ class ImuRecording:
     accel_bias: FloatArray
 
     def __iter__(self) -> Iterator[ImuSample]:
+        """Yield sample by sample."""
         for stamp, gyro, accel in zip(self.stamps_ns, self.gyro, self.accel, strict=True):
             yield ImuSample(int(stamp), gyro, accel)
 

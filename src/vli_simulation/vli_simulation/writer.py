@@ -44,6 +44,7 @@ class BagWriter:
         self._connections: dict[str, Connection] = {}
 
     def __enter__(self) -> BagWriter:
+        """Open the bag and declare its topics."""
         self._writer.open()
         image = ("/camera/image_raw/compressed", "CompressedImage") if self._compressed else ("/camera/image_raw", "Image")
         camera = [
