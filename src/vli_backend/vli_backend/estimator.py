@@ -140,7 +140,8 @@ class WindowEstimator:
     def add_frame(self, frame: FrontEndOutput, session: int) -> FrameResult:
         """Return the pose of one long frame; at a keyframe, solve the window."""
         tracks, imu = frame.tracks, self._usable(frame.preintegration)
-        predicted = self._predictor.predict(tracks.stamp_ns, imu, tracks.stationary)
+        inflate = frame.preintegration.inflate if frame.preintegration is not None else 1.0
+        predicted = self._predictor.predict(tracks.stamp_ns, imu, tracks.stationary, inflate)
         found = self._frame_pose(tracks, predicted)
         self._predictor.observe(tracks.stamp_ns, found.T_map_camera)
         self._restarted.update(int(i) for i in tracks.ids[(tracks.flags & TrackFlag.TEMPLATE) > 0])

@@ -47,7 +47,9 @@ class InertialScale:
         """Take a frame and its live pose; at the end of a piece return scale and relative sigma."""
         T_odom_imu = inverse(estimate.T_map_odom) @ estimate.T_map_imu
         seen = pose(T_odom_imu[:3, :3], (T_odom_imu @ self._T_imu_cam)[:3, 3])
-        follows = frame.preintegration is not None and frame.preintegration.from_ns == self._keyframe_ns
+        imu = frame.preintegration
+        # Across a gap the IMU tells little of the path.
+        follows = imu is not None and imu.from_ns == self._keyframe_ns and imu.inflate == 1.0
         if frame.tracks.stationary or (self._keyframes and not follows):
             self.clear()
         if self._between:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -41,12 +41,13 @@ class Predictor:
         self._T_imu_cam = T_imu_cam
         self._state: KeyframeState | None = None
         self._T_map_imu_predicted = np.eye(4)
+        self._predicted_ns = 0
         self._frames: list[tuple[int, FloatArray]] = []
 
     def set_keyframe(self, stamp_ns: int, state: KeyframeState) -> None:
         """Restart the integration at a solved keyframe, which is also the newest frame."""
         self._state = state
-        self._T_map_imu_predicted = state.T_map_imu
+        self._T_map_imu_predicted, self._predicted_ns = state.T_map_imu, stamp_ns
         self._frames = [*self._frames[-2:-1], (stamp_ns, state.T_map_imu @ self._T_imu_cam)]
 
     def observe(self, stamp_ns: int, T_map_camera: FloatArray) -> None:
@@ -63,29 +64,39 @@ class Predictor:
         result: FloatArray = self._T_imu_cam[:3, :3] @ turn / max((last_ns - before_ns) * 1e-9, 1e-6)
         return result
 
-    def predict(self, stamp_ns: int, imu: gtsam.PreintegratedCombinedMeasurements | None, stationary: bool) -> Prediction:
+    def predict(
+        self, stamp_ns: int, imu: gtsam.PreintegratedCombinedMeasurements | None, stationary: bool, inflate: float = 1.0
+    ) -> Prediction:
         """Return the prediction for a frame.
 
         Args:
             stamp_ns: of the frame.
             imu: preintegration from the last keyframe to it, or None.
             stationary: True where the front end sees no motion.
+            inflate: factor on the variances of the IMU, see :class:`vli_common.types.Preintegration`.
         """
         last_ns, last = self._frames[-1]
+        if imu is None or self._state is None:
+            return self._without_imu(stamp_ns, stationary)
+        nav = imu.predict(self._state.nav_state(), self._state.bias())
+        T_map_imu = nav.pose().matrix()
+        step = inverse(self._T_map_imu_predicted) @ T_map_imu
+        step_begins_ns, self._predicted_ns, self._T_map_imu_predicted = self._predicted_ns, stamp_ns, T_map_imu
+        if stationary:
+            return Prediction(last, np.zeros(3), _information(*_REST))
+        if step_begins_ns != last_ns:
+            # The frame before had no IMU: the step leads from an older frame, whose motion the last pose has already.
+            return replace(self._without_imu(stamp_ns, stationary), velocity=nav.velocity())
         elapsed = (stamp_ns - last_ns) * 1e-9
-        if imu is not None and self._state is not None:
-            nav = imu.predict(self._state.nav_state(), self._state.bias())
-            T_map_imu = nav.pose().matrix()
-            step = inverse(self._T_map_imu_predicted) @ T_map_imu
-            self._T_map_imu_predicted = T_map_imu
-            if stationary:
-                return Prediction(last, np.zeros(3), _information(*_REST))
-            predicted = orthonormalised(last @ inverse(self._T_imu_cam) @ step @ self._T_imu_cam)
-            sigmas = (s + growth * elapsed for s, growth in zip(_IMU, _IMU_GROWTH, strict=True))
-            return Prediction(predicted, nav.velocity(), _information(*sigmas))
+        predicted = orthonormalised(last @ inverse(self._T_imu_cam) @ step @ self._T_imu_cam)
+        sigmas = ((s + growth * elapsed) * inflate**0.5 for s, growth in zip(_IMU, _IMU_GROWTH, strict=True))
+        return Prediction(predicted, nav.velocity(), _information(*sigmas))
+
+    def _without_imu(self, stamp_ns: int, stationary: bool) -> Prediction:
+        last_ns, last = self._frames[-1]
         if stationary or len(self._frames) < 2:
             return Prediction(last, np.zeros(3), _information(*(_REST if stationary else _NO_IMU)))
-        return self._constant_velocity(elapsed)
+        return self._constant_velocity((stamp_ns - last_ns) * 1e-9)
 
     def _constant_velocity(self, elapsed: float) -> Prediction:
         (before_ns, before), (last_ns, last) = self._frames

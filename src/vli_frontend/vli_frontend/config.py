@@ -116,7 +116,7 @@ class ImuConfig:
     )
     walk_factor: float = parameter(2.0, minimum=0.1, maximum=100.0, doc="on both random walks; higher: biases may change faster")
     interpolated_gap_s: float = parameter(
-        0.05, unit="s", minimum=0.0, maximum=1.0, doc="gaps up to this are interpolated; beyond, the covariance grows"
+        0.05, unit="s", minimum=0.0, maximum=1.0, doc="across gaps up to this the gyroscope still predicts where features go"
     )
     longest_gap_s: float = parameter(
         0.5, unit="s", minimum=0.0, maximum=5.0, doc="an interval with a longer gap has no IMU factor"

@@ -10,6 +10,7 @@ from vli_common.calibration import ImuCalibration
 from vli_common.geometry import so3_exp
 from vli_common.types import Counters, ImuBias, Preintegration
 from vli_frontend.config import ImuConfig
+from vli_frontend.imu_gaps import HISTORY, HOLE, gap_variance, period_ns
 from vli_frontend.imu_noise import NoiseMonitor
 from vli_frontend.synchroniser import ImuSegment, Synchroniser, seconds_to_ns
 
@@ -18,23 +19,31 @@ _INTEGRATION_SIGMA = 1e-5
 """Of the position per √s, metres: what integrating in steps leaves out."""
 
 
-def combined_params(imu: ImuCalibration, config: ImuConfig, inflate: float = 1.0) -> gtsam.PreintegrationCombinedParams:
+def variances(imu: ImuCalibration, config: ImuConfig) -> FloatArray:
+    """Return the continuous-time variances (2,) of gyroscope and accelerometer."""
+    accelerometer = max(imu.accelerometer_noise_density, config.accelerometer_noise)
+    gyroscope = config.gyroscope_factor * imu.gyroscope_noise_density
+    return np.array([gyroscope, accelerometer]) ** 2
+
+
+def combined_params(imu: ImuCalibration, config: ImuConfig) -> gtsam.PreintegrationCombinedParams:
     """Return GTSAM's noise parameters (continuous-time variances) for a calibrated IMU, gravity along −z.
 
     Args:
         imu: noise of the calibration.
         config: factors on it.
-        inflate: factor on the variances of the measurements, for samples that are interpolated across a gap.
     """
     params = gtsam.PreintegrationCombinedParams.MakeSharedU(GRAVITY)
-    accelerometer = max(imu.accelerometer_noise_density, config.accelerometer_noise)
-    gyroscope = config.gyroscope_factor * imu.gyroscope_noise_density
-    params.setAccelerometerCovariance(np.eye(3) * inflate * accelerometer**2)
-    params.setGyroscopeCovariance(np.eye(3) * inflate * gyroscope**2)
+    _set_noise(params, variances(imu, config))
     params.setBiasAccCovariance(np.eye(3) * (config.walk_factor * imu.accelerometer_random_walk) ** 2)
     params.setBiasOmegaCovariance(np.eye(3) * (config.walk_factor * imu.gyroscope_random_walk) ** 2)
     params.setIntegrationCovariance(np.eye(3) * _INTEGRATION_SIGMA**2)
     return params
+
+
+def _set_noise(params: gtsam.PreintegrationCombinedParams, variance: FloatArray) -> None:
+    params.setGyroscopeCovariance(np.eye(3) * variance[0])
+    params.setAccelerometerCovariance(np.eye(3) * variance[1])
 
 
 _LEAST_STEPS = 4
@@ -47,7 +56,7 @@ class Preintegrator:
 
     Samples are instants: each step takes the signal's mean over it, the first and the last step end at the frames' own stamps.
     Every answer is integrated afresh (1.5 µs a sample), so that it may be kept. Noise is that of the calibration, or what the
-    samples show where that is clearly more.
+    samples show where that is clearly more; across a gap, what interpolating costs (:mod:`vli_frontend.imu_gaps`) comes on top.
 
     Args:
         imu: noise of the calibration.
@@ -59,7 +68,7 @@ class Preintegrator:
     def __init__(self, imu: ImuCalibration, config: ImuConfig, synchroniser: Synchroniser, counters: Counters) -> None:
         self._noise, self._config = NoiseMonitor(imu), config
         self._params = combined_params(imu, config)
-        self._interpolated_ns, self._longest_ns = seconds_to_ns(config.interpolated_gap_s), seconds_to_ns(config.longest_gap_s)
+        self._longest_ns = seconds_to_ns(config.longest_gap_s)
         self._synchroniser = synchroniser
         self._counters = counters
         self._bias, self._interval_bias = gtsam.imuBias.ConstantBias(), gtsam.imuBias.ConstantBias()
@@ -89,20 +98,34 @@ class Preintegrator:
         if segment is None or segment.longest_gap_ns > self._longest_ns:
             self._counters.add("intervals_without_imu")
             return None
-        # The error of an interpolation grows with the gap: its standard deviation at least in proportion.
-        inflate = max(1.0, segment.longest_gap_ns / max(self._interpolated_ns, 1)) ** 2
+        gaps = self._gaps(segment)
+        inflate = max((float((variance / self._variance).max()) for variance in gaps.values()), default=1.0)
         if inflate > 1.0:
             self._counters.add("intervals_inflated")
-        return Preintegration(stamp_ns, self._from_ns, self._integrate(segment, inflate), inflate, session)
+        return Preintegration(stamp_ns, self._from_ns, self._integrate(segment, gaps), inflate, session)
 
-    def _integrate(self, segment: ImuSegment, inflate: float) -> gtsam.PreintegratedCombinedMeasurements:
-        params = self._params if inflate == 1.0 else combined_params(self._noise.imu, self._config, inflate)
+    @property
+    def _variance(self) -> FloatArray:
+        return variances(self._noise.imu, self._config)
+
+    def _gaps(self, segment: ImuSegment) -> dict[int, FloatArray]:
+        """Return the variances (2,) of gyroscope and accelerometer across each length of gap that the segment rests on."""
+        stamps, values = self._synchroniser.imu.newest(HISTORY, int(segment.stamps[-1]))
+        hole_ns = HOLE * period_ns(stamps)
+        longest = segment.gaps_ns[segment.gaps_ns > hole_ns]
+        return {int(gap): self._variance + gap_variance(stamps, values, int(gap)) for gap in np.unique(longest)}
+
+    def _integrate(self, segment: ImuSegment, gaps: dict[int, FloatArray]) -> gtsam.PreintegratedCombinedMeasurements:
+        params = combined_params(self._noise.imu, self._config) if gaps else self._params
         measurements = gtsam.PreintegratedCombinedMeasurements(params, self._interval_bias)
         stamps_s = (segment.stamps - segment.stamps[0]) * 1e-9
         steps = np.diff(stamps_s)
         gyro = step_means(segment.gyro, stamps_s)
         accel = force_at_start(step_means(segment.accel, stamps_s), gyro, steps, self._interval_bias)
-        for a, w, dt in zip(accel, gyro, steps.tolist(), strict=True):
+        for a, w, dt, gap in zip(accel, gyro, steps.tolist(), segment.gaps_ns.tolist(), strict=True):
+            if gaps:
+                # GTSAM reads the noise at each step.
+                _set_noise(params, gaps.get(gap, self._variance))
             measurements.integrateMeasurement(a, w, dt)
         return measurements
 
@@ -127,7 +150,7 @@ def step_means(values: FloatArray, stamps_s: FloatArray) -> FloatArray:
     """Return the mean of a signal over each step between its samples: the trapezoidal rule less h²/12 times the curvature.
 
     At 200 Hz the rule alone takes 1 % off a hand's tremor of 10 Hz, and so off the scale of a path that the IMU measures. Where
-    samples are few or a gap lies between them the curvature is not known: the rule stays.
+    samples are few or a gap lies between them, or at the ends, the curvature is not known: the rule stays.
 
     Args:
         values: (M, 3); the first and the last are interpolated, the others samples.
@@ -136,7 +159,7 @@ def step_means(values: FloatArray, stamps_s: FloatArray) -> FloatArray:
     steps = np.diff(stamps_s)
     means: FloatArray = 0.5 * (values[1:] + values[:-1])
     inner = steps[1:-1]
-    if len(inner) < _LEAST_STEPS or inner.max() > _EVEN * inner.min():
+    if len(inner) < _LEAST_STEPS or steps.max() > _EVEN * inner.min():
         return means
     slopes = np.diff(values[1:-1], axis=0) / inner[:, None]
     curvature = np.diff(slopes, axis=0) / (0.5 * (inner[1:] + inner[:-1]))[:, None]

@@ -23,13 +23,18 @@ class ImuSegment:
         stamps: (M,) int64, IMU clock, first and last are the ends asked for; M ≥ 2.
         gyro: (M, 3) rad/s.
         accel: (M, 3) m/s².
-        longest_gap_ns: between consecutive samples that the segment rests on.
+        gaps_ns: (M − 1,) int64, of the samples around each step: longer than the step at the two ends.
     """
 
     stamps: IntArray
     gyro: FloatArray
     accel: FloatArray
-    longest_gap_ns: int
+    gaps_ns: IntArray
+
+    @property
+    def longest_gap_ns(self) -> int:
+        """Longest interval between consecutive samples that the segment rests on."""
+        return int(self.gaps_ns.max())
 
     @property
     def mean_rate(self) -> FloatArray:
@@ -80,8 +85,14 @@ class ImuHistory:
         inside = slice(first + 1, last)
         ends = np.stack([self._at(first, begin_ns), self._at(last - 1, end_ns)])
         values = np.concatenate([ends[:1], self._values[inside], ends[1:]])
-        longest = int(np.diff(stamps[first : last + 1]).max())
-        return ImuSegment(np.concatenate([[begin_ns], stamps[inside], [end_ns]]), values[:, :3], values[:, 3:], longest)
+        gaps = np.diff(stamps[first : last + 1])
+        return ImuSegment(np.concatenate([[begin_ns], stamps[inside], [end_ns]]), values[:, :3], values[:, 3:], gaps)
+
+    def newest(self, count: int, until_ns: int) -> tuple[IntArray, FloatArray]:
+        """Return stamps (M,) and values (M, 6), gyroscope and accelerometer, of the last ``count`` samples up to a stamp."""
+        end = int(np.searchsorted(self._stamps[: self._count], until_ns, side="right"))
+        chosen = slice(max(0, end - count), end)
+        return self._stamps[chosen], self._values[chosen]
 
     def _at(self, index: int, stamp_ns: int) -> FloatArray:
         """Return the values at a stamp between samples ``index`` and ``index + 1``."""

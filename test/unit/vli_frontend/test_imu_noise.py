@@ -19,7 +19,7 @@ def segment(rng: np.random.Generator, scale: float, start_s: float, tremor: floa
     noise = scale * np.sqrt(rate_hz) * rng.normal(size=(len(stamps), 6))
     gyro = 0.1 * shake + IMU.gyroscope_noise_density * noise[:, :3] + 0.01
     accel = 3.0 * shake + IMU.accelerometer_noise_density * noise[:, 3:] + np.array([0.0, 0.0, 9.81])
-    return ImuSegment(stamps, gyro, accel, 5_000_000)
+    return ImuSegment(stamps, gyro, accel, np.full(len(stamps) - 1, 5_000_000))
 
 
 def monitored(scale: float, tremor: float = 1.0, intervals: int = 30) -> NoiseMonitor:

@@ -30,7 +30,7 @@ def _segment(begin_s: float, end_s: float, amplitude: float) -> ImuSegment:
     times = np.linspace(begin_s, end_s, 8)
     stamps: IntArray = np.round(times * SECOND).astype(np.int64)
     gyro = np.stack([_rate(t, amplitude) for t in times]) + BIAS
-    return ImuSegment(stamps, gyro, np.zeros_like(gyro), 5_000_000)
+    return ImuSegment(stamps, gyro, np.zeros_like(gyro), np.full(len(stamps) - 1, 5_000_000))
 
 
 def _watch(
