@@ -9,11 +9,12 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from graph_tools import NODES, START_S, command, wait
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rclpy.qos import qos_profile_sensor_data
@@ -23,7 +24,7 @@ from tiny_bag import TinyBag, write_calibration
 from vli_bringup.cli import main
 from vli_bringup.graph import NodeDescription, Playback, describe_graph
 from vli_bringup.listener import GraphListener
-from vli_bringup.processes import GraphError, NodeProcesses
+from vli_bringup.processes import MAX_RESTARTS, GraphError, NodeProcesses
 from vli_bringup.recorder import Recorder
 from vli_bringup.settings import Settings, to_yaml
 from vli_common.calibration import load_calibration
@@ -31,9 +32,6 @@ from vli_common.geometry import align
 from vli_common.status import NodeState
 
 pytestmark = pytest.mark.graph
-
-NODES = [node.executable for node in describe_graph(Path("none"))]
-_START_S = 240.0
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -61,19 +59,6 @@ def parameter_file(tmp_path: Path) -> Path:
 def listener(calibration: Path) -> Iterator[GraphListener]:
     with GraphListener(Recorder(load_calibration(calibration))) as item:
         yield item
-
-
-def wait(listener: GraphListener, condition: Callable[[], bool], timeout_s: float = _START_S) -> None:
-    deadline_s = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline_s, listener.statuses
-        listener.spin()
-
-
-def command(executable: str, *parameters: str) -> list[str]:
-    (node,) = [node for node in describe_graph(Path("none")) if node.executable == executable]
-    arguments = [argument for parameter in parameters for argument in ("-p", parameter)]
-    return [sys.executable, "-m", node.module, "--ros-args", *arguments]
 
 
 @pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM])
@@ -107,7 +92,7 @@ def test_every_node_started_singly_stops_cleanly_on_a_signal(listener: GraphList
     ],
 )
 def test_a_node_that_cannot_start_says_why_in_one_line(executable: str, parameter: str, complaint: str) -> None:
-    result = subprocess.run(command(executable, parameter), capture_output=True, text=True, timeout=_START_S, check=False)
+    result = subprocess.run(command(executable, parameter), capture_output=True, text=True, timeout=START_S, check=False)
     assert complaint in result.stderr
     assert result.stderr.count("\n") == 1
     assert result.returncode == 2
@@ -116,7 +101,7 @@ def test_a_node_that_cannot_start_says_why_in_one_line(executable: str, paramete
 def change_state(listener: GraphListener, node: str, transition: int) -> bool:
     """Do what a lifecycle manager does; return whether the node obeyed."""
     client = listener.node.create_client(ChangeState, f"{node}/change_state")
-    assert client.wait_for_service(_START_S)
+    assert client.wait_for_service(START_S)
     future = client.call_async(ChangeState.Request(transition=Transition(id=transition)))
     wait(listener, future.done, 30.0)
     listener.node.destroy_client(client)
@@ -192,21 +177,65 @@ def test_a_reset_begins_a_new_session_in_every_node(
     assert not any(Path(f"/proc/{pid}").exists() for pid in pids.values())
 
 
-def test_a_node_that_dies_is_told_and_none_is_left_behind(calibration: Path, parameter_file: Path) -> None:
-    with NodeProcesses(describe_graph(calibration), parameter_file) as processes:
+def killed(processes: NodeProcesses, name: str) -> None:
+    """Kill a node and see that it is gone."""
+    os.kill(processes.pids[name], signal.SIGKILL)
+    while Path(f"/proc/{processes.pids[name]}/status").read_text().split("State:")[1].split()[0] != "Z":
+        time.sleep(0.01)
+
+
+def test_what_plays_a_bag_is_not_started_again_and_no_node_is_left_behind(
+    tmp_path: Path, calibration: Path, parameter_file: Path
+) -> None:
+    nodes = describe_graph(calibration, playback=Playback(tmp_path / "none"))
+    with NodeProcesses(nodes, parameter_file) as processes:
         pids = processes.pids
-        os.kill(pids["demux_node"], signal.SIGKILL)
-        time.sleep(0.5)
-        with pytest.raises(GraphError, match="demux_node ended with code '-9'"):
+        killed(processes, "driver_node")
+        with pytest.raises(GraphError, match="driver_node ended with code '-9'"):
             processes.check()
     assert not any(Path(f"/proc/{pid}").exists() for pid in pids.values())
+
+
+def test_a_node_that_crashes_again_and_again_ends_the_graph(calibration: Path, parameter_file: Path) -> None:
+    told: list[str] = []
+    with NodeProcesses(describe_graph(calibration)[1:2], parameter_file, told.append) as processes:
+        for _ in range(MAX_RESTARTS):
+            killed(processes, "demux_node")
+            processes.check()
+        assert (
+            told == ["demux_node crashed and is started again: demux_node ended with code '-9' and said nothing"] * MAX_RESTARTS
+        )
+        assert processes.restarts == {"demux_node": MAX_RESTARTS}
+        killed(processes, "demux_node")
+        with pytest.raises(GraphError, match="demux_node crashed more than 3 times in 60 s: demux_node ended with code '-9'"):
+            processes.check()
+
+
+def test_the_nodes_stop_when_the_command_that_started_them_is_killed(calibration: Path, parameter_file: Path) -> None:
+    script = f"""
+import pathlib, time
+from vli_bringup.graph import describe_graph
+from vli_bringup.processes import NodeProcesses
+with NodeProcesses(describe_graph(pathlib.Path({str(calibration)!r})), pathlib.Path({str(parameter_file)!r})) as processes:
+    print(*processes.pids.values(), flush=True)
+    time.sleep(600)
+"""
+    command = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+    assert command.stdout is not None
+    pids = command.stdout.readline().split()
+    command.kill()
+    command.wait(10)
+    deadline_s = time.monotonic() + START_S
+    while any(Path(f"/proc/{pid}").exists() for pid in pids):
+        assert time.monotonic() < deadline_s
+        time.sleep(0.1)
 
 
 def test_the_last_line_of_a_node_that_cannot_start_is_the_error_of_the_graph(tmp_path: Path, parameter_file: Path) -> None:
     playback = Playback(tmp_path / "none")
     driver: list[NodeDescription] = describe_graph(write_calibration(tmp_path / "c.yaml"), playback=playback)[:1]
     with NodeProcesses(driver, parameter_file) as processes:
-        deadline_s = time.monotonic() + _START_S
+        deadline_s = time.monotonic() + START_S
         with pytest.raises(GraphError, match="does not exist; expected a rosbag2 directory"):  # noqa: PT012
             while time.monotonic() < deadline_s:
                 processes.check()
@@ -219,7 +248,7 @@ def test_the_doctor_listens_to_a_running_sensor(tmp_path: Path, calibration: Pat
     bag = TinyBag(seconds=40.0).write(tmp_path / "bag")
     driver = subprocess.Popen(command("driver_node", f"bag:={bag}"))
     try:
-        deadline_s = time.monotonic() + _START_S
+        deadline_s = time.monotonic() + START_S
         out = ""
         while "IMU and camera overlap" not in out or "driver_node" not in out:
             assert time.monotonic() < deadline_s, out

@@ -12,11 +12,18 @@ from vli_common.types import Mode
 
 @dataclass(frozen=True, slots=True)
 class NodeDescription:
-    """One process of the graph; ``parameters`` are those beyond the parameter file."""
+    """One process of the graph.
+
+    Args:
+        package, executable: as ``ros2 run`` names them.
+        parameters: those beyond the parameter file.
+        respawn: whether it is started again when it crashes. Not what plays a bag: it would begin anew.
+    """
 
     package: str
     executable: str
     parameters: Mapping[str, Any] = field(default_factory=dict)
+    respawn: bool = True
 
     @property
     def module(self) -> str:
@@ -48,7 +55,7 @@ NODE_ONLY = frozenset(
         *("mode", "calibration_file", "imu_calibration_file", "autostart"),
         *("bag", "rate", "loop", "start", "duration", "wait_for", "wait_timeout"),
         *("image_topic", "exposure_topic", "imu_topic"),
-        *("save_path", "load_path", "export_path", "autosave_s", "autosave_path"),
+        *("save_path", "load_path", "export_path", "autosave_s", "autosave_path", "reload_autosave"),
     }
 )
 """Parameters of nodes that are no parameter of a stage; a parameter file may hold them, and only the nodes mind them."""
@@ -86,5 +93,5 @@ def describe_graph(
             "wait_for": ",".join([*awaited, audience] if audience else awaited),
         }
     own = {"mapping_node": {"save_path": str(save_path.absolute())}} if save_path is not None else {}
-    nodes = [NodeDescription("vli_driver", SCANNER, source)]
+    nodes = [NodeDescription("vli_driver", SCANNER, source, respawn=playback is None)]
     return nodes + [NodeDescription(package, name, {**shared, **own.get(name, {})}) for package, name in STAGES]

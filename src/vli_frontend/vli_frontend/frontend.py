@@ -37,19 +37,20 @@ class FrontEnd:
         calibration: camera; IMU and ``T_cam_imu`` too unless the mode leaves the IMU out.
         config: see :class:`FrontEndConfig`.
         mode: which sensors take part.
+        first_id: of the tracks; where the back end may still hold landmarks of another front end, one that it did not use.
 
     Raises:
         CalibrationError: the mode needs the IMU and the calibration does not have it.
     """
 
-    def __init__(self, calibration: Calibration, config: FrontEndConfig, mode: Mode) -> None:
+    def __init__(self, calibration: Calibration, config: FrontEndConfig, mode: Mode, first_id: int = 1) -> None:
         self.counters = Counters()
         self._calibration, self._config, self._mode = calibration, config, mode
         wait_ns = seconds_to_ns(config.imu.max_wait_s)
         self._synchroniser = Synchroniser(calibration.timeshift_ns, wait_ns, mode.uses_imu, self.counters)
         self._preintegrator = self._make_preintegrator() if mode.uses_imu else None
         self._time_shift = TimeShiftMonitor(config.time_shift)
-        self._tracker = Tracker(calibration.camera, config, self.counters)
+        self._tracker = Tracker(calibration.camera, config, self.counters, first_id)
         self._keyframes = KeyframeRule(config.keyframe, calibration.camera.focal_px, mode.uses_laser)
         # Long and short frames alternate: 1.5 frame periods reach the neighbour, and no farther one where the rhythm jitters.
         self._stripes = StripeDistance(round(1.5 * NANOSECONDS / calibration.rate_hz))

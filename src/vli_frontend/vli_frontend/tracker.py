@@ -80,20 +80,22 @@ class Tracker:
         camera: of the calibration.
         config: see :class:`FrontEndConfig`.
         counters: of the stage.
+        first_id: of a session's tracks.
     """
 
-    def __init__(self, camera: CameraModel, config: FrontEndConfig, counters: Counters) -> None:
+    def __init__(self, camera: CameraModel, config: FrontEndConfig, counters: Counters, first_id: int = 1) -> None:
+        self._first_id = first_id
         self._camera, self._config, self._counters = camera, config, counters
         self._templates = PatchTemplates(config.max_features)
         self._outliers = OutlierRejection(config.klt.outlier_px / camera.focal_px)
         self.reset()
 
     def reset(self) -> None:
-        """Forget all tracks; ids start at 1 again."""
+        """Forget all tracks; ids start anew."""
         none, nowhere = np.empty(0, np.int64), np.empty((0, 2))
         self.tracks = TrackTable.new(none, nowhere, nowhere, none, np.zeros(2), np.empty(0))
         self._previous: Frame | None = None
-        self._next_id = 1
+        self._next_id = self._first_id
         self._outliers.reset()
 
     @property

@@ -43,6 +43,7 @@ def save_map(path: Path, snapshot: Snapshot) -> None:
         "points": len(snapshot),
         "views": len(snapshot.views),
         "light": None if snapshot.light is None else _light_to_json(snapshot.light),
+        "origin": snapshot.origin,
     }
     with replacing(path) as partial, partial.open("wb") as stream:
         with zipfile.ZipFile(stream, "w", zipfile.ZIP_STORED) as archive:
@@ -74,6 +75,18 @@ def load_map(path: Path) -> Snapshot:
     except (KeyError, ValueError, TypeError, EOFError, RuntimeError, NotImplementedError) as error:
         raise InputError(f"map '{path}' is damaged ({error}); save it again") from error
     return _checked(path, header, columns, light)
+
+
+def map_origin(path: Path) -> str:
+    """Return the origin of a map, see :class:`Snapshot`, without reading the map; empty where there is none, or no map.
+
+    Raises:
+        InputError: a map that cannot be read.
+    """
+    if not is_map(path):
+        return ""
+    with zipfile.ZipFile(path) as archive:
+        return str(_read_header(path, archive).get("origin", ""))
 
 
 def is_map(path: Path) -> bool:
@@ -129,7 +142,7 @@ def _checked(path: Path, header: dict[str, Any], arrays: dict[str, AnyArray], li
         raise InputError(f"map '{path}' is damaged: its points and views do not belong together; save it again")
     if not (np.isfinite(columns.position).all() and (columns.weight > 0).all()):
         raise InputError(f"map '{path}' is damaged: it has points that are nowhere; save it again")
-    return Snapshot(columns, views, light)
+    return Snapshot(columns, views, light, str(header.get("origin", "")))
 
 
 def _light_to_json(light: Light) -> dict[str, Any]:

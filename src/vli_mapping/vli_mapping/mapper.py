@@ -116,6 +116,24 @@ class Mapper:
         self._unrefined.clear()
         self._is_foreign = True
 
+    def resume(self, snapshot: Snapshot) -> None:
+        """Go on with a map of this very session, which a mapper before this one has saved: their poses share a frame.
+
+        The few scans that have entered the map of this one so far are dropped with it.
+        """
+        self.settle()
+        self._touched.clear()
+        self.map = restore(snapshot, self.config.map)
+        self._light = LightEstimator(snapshot.light)
+        self._unrefined.clear()
+        self._window.count_from(len(snapshot.views))
+
+    def waiting(self) -> list[Stripe]:
+        """Return the scans of the window as they would enter the map now, in order of time."""
+        if self._is_foreign:
+            return []
+        return [_stripe(item) for item in self._window.staying() if item.described]
+
     def reset(self, session: int) -> None:
         """Drop all that belongs to another session, and start a new map: poses of two sessions share no frame.
 

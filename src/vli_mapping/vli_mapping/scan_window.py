@@ -119,6 +119,12 @@ class ScanWindow:
         result._waiting.update((stamp, item) for stamp, item in self._waiting.items() if item.session == session)
         return result
 
+    def count_from(self, number: int) -> None:
+        """Let the scans be numbered from here on, those that are in the window too."""
+        for item in self._scans.values():
+            item.number += number
+        self._next_number += number
+
     def add_image(self, image: Image) -> None:
         """Take a long image; it is forgotten when it has coloured its scans, or waited too long."""
         self._images[image.stamp_ns] = image

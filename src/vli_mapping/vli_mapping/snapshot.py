@@ -28,11 +28,13 @@ class Snapshot:
         columns: of N points.
         views: (S, 3, 4), of the scans that ``columns.seen_by`` numbers.
         light: on board, None where it is not known.
+        origin: names the frame of the map among those of other sessions and back ends; empty where nobody said.
     """
 
     columns: Columns
     views: FloatArray
     light: Light | None
+    origin: str = ""
 
     def __len__(self) -> int:
         return len(self.columns.weight)

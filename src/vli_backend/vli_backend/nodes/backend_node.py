@@ -84,7 +84,7 @@ class BackEndNode(VliNode):
         self._last = BackEndOutput(0, TrackingState.INITIALISING, "waiting for the first frame")
         for topic in (ODOMETRY, POSE, PATH, WINDOW, BIAS, *((TF, TF_STATIC) if TFMessage else ())):
             self.advertise(topic)
-        self.receive(LASER_POINTS, scan_from_message, self._on_scan)
+        self.receive(LASER_POINTS, scan_from_message, self._on_scan, sheds=1)
         self.receive(PREINTEGRATION, preintegration_from_message, self._on_preintegration)
         self.receive(TRACKS, tracks_from_message, self._on_tracks)
         self.receive(MAP_CONSTRAINTS, constraints_from_message, self._on_constraints, ends=False, required=self.mode.uses_map)
@@ -128,7 +128,10 @@ class BackEndNode(VliNode):
         """Return the tracking state, since which frame, and why."""
         last = self._last
         values = {"tracking": last.state.value, "reason": last.reason, "stamp_ns": str(last.stamp_ns)}
-        return _HEALTH[last.state], last.reason, values
+        skipped = self.counters["frames_skipped"]
+        hint = f"too slow: {skipped} frames between keyframes have no pose" if skipped else ""
+        health = Health.WARN if hint and last.state is TrackingState.TRACKING else _HEALTH[last.state]
+        return health, last.reason or hint, values
 
     @property
     def back_end(self) -> BackEnd:
@@ -151,6 +154,9 @@ class BackEndNode(VliNode):
         for item in items:
             if isinstance(item, LaserScan):
                 self.back_end.add_scan(item)
+            elif self.is_behind and not item.tracks.keyframe and self._last.state is TrackingState.TRACKING:
+                # The window consists of keyframes, and the IMU of the frames after reaches back to one.
+                self.counters.add("frames_skipped")
             else:
                 self._publish(self.back_end.add_frame(item))
 

@@ -21,6 +21,8 @@ from std_srvs.srv import Trigger
 from vli_common.calibration import Calibration, load_calibration, parse_calibration, to_yaml
 from vli_common.errors import CalibrationError, MessageError, VliError
 from vli_common.messages import Session, session_from_message, session_to_message, status_from_message, status_to_message
+from vli_common.node.aside import Aside
+from vli_common.node.backlog import Backlog
 from vli_common.node.inputs import Input
 from vli_common.node.lifecycle import ManagedNode
 from vli_common.node.parameters import NodeConfig, NodeParameters
@@ -37,6 +39,8 @@ _FINISH_PERIOD_S = 0.1
 _QUEUE_DEPTHS = 12
 """The worker's queue holds this many times the depth of the topic."""
 _WAITING_HINT = "waiting for a calibration: give 'calibration_file' to the driver node or to this one"
+_ASIDE_S = 1.0
+"""A service under way gets this long to end when the node is stopped."""
 _STOP_S = 2.0
 _CALL_S = 10.0
 
@@ -72,11 +76,16 @@ class VliNode(ManagedNode):
         self._hint = "waiting for a lifecycle manager to configure it: 'autostart' is false"
         self._calibration_hint = ""
         self._worker = Worker(name, self.fail)
+        self._aside = Aside(name)
+        self._backlog = Backlog()
+        self.is_behind = False
+        """True where the message that is being handled came too long ago, and those before it too: leave out what can be."""
         self._inputs: dict[str, Input] = {}
         self._matchers: list[Callable[[], str | None]] = []
         self._publishers_by_topic: dict[str, Publisher] = {}
         self._sent = Counters()
         self._finished_sources: dict[str, dict[str, str]] = {}
+        self._started_ns = time.time_ns()
         self.others: dict[str, StageStatus] = {}
         """The newest status of each node, this one too."""
         self._offered: Calibration | None = None
@@ -109,6 +118,9 @@ class VliNode(ManagedNode):
     def on_finish(self) -> None:
         """Process what is still held back: the input has ended."""
 
+    def on_restart(self, node: str) -> None:
+        """Another node of the graph has been started anew: what it knew is gone."""
+
     def stage_counters(self) -> Counters:
         """Return the counters of the stage."""
         return Counters()
@@ -116,6 +128,16 @@ class VliNode(ManagedNode):
     def stage_status(self) -> tuple[Health, str, dict[str, str]]:
         """Return the stage's health, a hint in words, and further values."""
         return Health.OK, "", {}
+
+    @property
+    def started_ns(self) -> int:
+        """Wall clock at which the node was made: tells it from its predecessor of the same name."""
+        return self._started_ns
+
+    @property
+    def newest_session(self) -> int:
+        """Number of the newest session that was heard of; the worker may still be busy with the one before."""
+        return self._newest_session
 
     # What a node does with topics
 
@@ -128,6 +150,7 @@ class VliNode(ManagedNode):
         ends: bool = True,
         required: bool = True,
         limit: int | None = None,
+        sheds: int = 0,
     ) -> None:
         """Subscribe; ``read`` and ``handle`` run in the worker.
 
@@ -139,8 +162,9 @@ class VliNode(ManagedNode):
             ends: False for feedback, which does not tell the end of the input.
             required: False for an input that may have no publisher.
             limit: messages that may wait for the worker, by default 12 times the depth of the topic.
+            sheds: of this topic, so many in a row are dropped at a time while the worker is behind for good; 0: none.
         """
-        entry = Input(topic, name or topic.name, ends, required)
+        entry = Input(topic, name or topic.name, ends, required, sheds)
         most = limit or _QUEUE_DEPTHS * topic.depth
 
         def accept(message: Any) -> None:
@@ -155,6 +179,10 @@ class VliNode(ManagedNode):
         entry.subscribe(self, callback)
         self._inputs[topic.name] = entry
         self._matchers.append(partial(entry.adapt, self, callback))
+
+    def received(self, topic: Topic) -> int:
+        """Return how many messages of a topic of :meth:`receive` have come in this session."""
+        return self._inputs[topic.name].received
 
     def advertise(self, topic: Topic, name: str | None = None) -> Publisher:
         """Make the publisher of a topic, for :meth:`send`."""
@@ -175,13 +203,19 @@ class VliNode(ManagedNode):
         """Return True where anyone subscribes to a topic of :meth:`advertise`."""
         return bool(self._publishers_by_topic[topic.name].get_subscription_count())
 
-    def serve(self, name: str, action: Callable[[], str]) -> None:
-        """Offer the service ``~/name`` (std_srvs/Trigger); ``action`` runs in the callback and returns the answer."""
+    def serve(self, name: str, action: Callable[[], str], aside: bool = False) -> None:
+        """Offer the service ``~/name`` (std_srvs/Trigger), answered with what ``action`` returns or raises.
 
-        def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-            response.success, response.message = True, ""
+        Args:
+            name: of the service.
+            action: what it does.
+            aside: run it in a thread of its own, since it takes long: messages are taken meanwhile. One at a time.
+        """
+
+        async def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
             try:
-                response.message = action()
+                response.message = await self._aside.run(action, self.executor) if aside else action()
+                response.success = True
             except Exception as error:
                 response.success, response.message = False, str(error)
             return response
@@ -283,6 +317,7 @@ class VliNode(ManagedNode):
 
     def close(self) -> bool:
         """Stop the worker and destroy the node; return False where a job would not end."""
+        self._aside.finish(_ASIDE_S)
         stopped = self._worker.stop(_STOP_S)
         if stopped:
             self.destroy_node()
@@ -338,6 +373,10 @@ class VliNode(ManagedNode):
             state = self.state if self.is_active else NodeState.INACTIVE
             self.counters.add(f"{entry.topic.name}_while_{state.value}")
             return
+        self.is_behind = self._backlog.is_behind(arrived_s)
+        if entry.is_shed(self.is_behind):
+            self._worker.dropped.add(entry.topic.name)
+            return
         try:
             value = read(message)
         except MessageError as error:
@@ -392,6 +431,8 @@ class VliNode(ManagedNode):
             self.get_logger().warning(str(error), throttle_duration_sec=5.0)
             return
         if session.number > self._newest_session:
+            # Every node keeps it for those that come later: who raised it may be gone by then.
+            self.send(SESSION, message)
             self._begin(session)
 
     def _begin(self, session: Session) -> None:
@@ -422,7 +463,12 @@ class VliNode(ManagedNode):
         except MessageError:
             self.counters.add("status_malformed")
             return
+        previous = self.others.get(status.node)
         self.others[status.node] = status
+        if previous is not None and _start(previous) < _start(status):
+            self._finished_sources.pop(status.node, None)
+            self.get_logger().warning(f"'{status.node}' was started anew")
+            self.enqueue(partial(self.on_restart, status.node))
         if status.state is NodeState.FINISHED and status.values.get("session") == str(self.session):
             self._finished_sources[status.node] = status.values
 
@@ -473,7 +519,7 @@ class VliNode(ManagedNode):
             health=health,
             state=self.state,
             hint=self._hint or self._calibration_hint or hint,
-            values={"session": str(self.session), **values, **self._figures()},
+            values={"session": str(self.session), "started_ns": str(self.started_ns), **values, **self._figures()},
         )
 
     def _figures(self) -> dict[str, str]:
@@ -489,3 +535,9 @@ class VliNode(ManagedNode):
         for prefix, counters in (("node", self.counters), ("stage", self.stage_counters())):
             figures |= {f"{prefix}.{name}": str(count) for name, count in list(counters.values.items())}
         return figures
+
+
+def _start(status: StageStatus) -> int:
+    """Return when the node of a status was started; 0 where it does not say."""
+    text = status.values.get("started_ns", "")
+    return int(text) if text.isdecimal() else 0

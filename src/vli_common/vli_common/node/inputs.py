@@ -29,17 +29,20 @@ class Input:
         name: it is subscribed under.
         ends: False for feedback, which does not tell the end of the input.
         required: False for an input that may have no publisher.
+        sheds: messages in a row that are dropped at a time under overload.
     """
 
     topic: Topic
     name: str
     ends: bool
     required: bool
+    sheds: int = 0
     subscription: Subscription | None = None
     rate: RateMeter = field(default_factory=RateMeter)
     received: int = 0
     last_s: float = field(default_factory=time.monotonic)
     _is_mismatched: bool = False
+    _left_to_shed: int = 0
 
     def subscribe(self, node: Node, callback: Callable[[Any], None], profile: QoSProfile | None = None) -> None:
         """Subscribe, reliably unless ``profile`` says otherwise."""
@@ -78,13 +81,24 @@ class Input:
         self.received += 1
         self.last_s = time.monotonic()
 
+    def is_shed(self, is_behind: bool) -> bool:
+        """Return True where the next message is to be dropped."""
+        if is_behind and not self._left_to_shed:
+            self._left_to_shed = self.sheds
+        if not self._left_to_shed:
+            return False
+        self._left_to_shed -= 1
+        return True
+
     @property
     def is_unmatched(self) -> bool:
         """True where the node needs the input and nobody publishes it."""
         return self.required and self.subscription is not None and not self.subscription.get_publisher_count()
 
     def has_ended(self, finished: Mapping[str, Mapping[str, str]]) -> bool:
-        """Return True once the source has finished and all that it sent has come.
+        """Return True once the source has finished and all that it sent has come: as many as it says, or no more for a second.
+
+        They differ where a message was lost, and where either side was started anew and counts from then on.
 
         Args:
             finished: node → values of its status, of the nodes that have finished.
@@ -93,7 +107,7 @@ class Input:
         if source not in finished:
             return False
         sent = int(finished[source].get(f"sent.{self.topic.name}", "0"))
-        return self.received >= sent or time.monotonic() - self.last_s > _QUIET_S
+        return self.received == sent or time.monotonic() - self.last_s > _QUIET_S
 
     def figures(self, waiting: int) -> dict[str, str]:
         """Return what the status says of it; ``waiting`` messages are in the worker's queue."""

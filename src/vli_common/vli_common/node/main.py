@@ -27,6 +27,8 @@ _SIGNAL_S = 0.1
 """A signal is answered this late at most: the executor's wait does not end with it."""
 _TEARDOWN_S = 3.0
 """The middleware may take this long to let go of a node that has stopped, its worker's last job included."""
+STOP_WITH_PARENT = "VLI_STOP_WITH_PARENT"
+"""Environment variable: where it is set, the node stops when the process that started it is gone."""
 _UNUSABLE = 2
 _FAILED = 1
 
@@ -81,7 +83,8 @@ def _limit_teardown(code: int) -> None:
 def _spin(node: VliNode, stop: threading.Event) -> None:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    while not (stop.is_set() or node.failure or node.is_shut_down):
+    parent = os.getppid() if os.environ.get(STOP_WITH_PARENT) else None
+    while not (stop.is_set() or node.failure or node.is_shut_down or parent not in (None, os.getppid())):
         executor.spin_once(timeout_sec=_SIGNAL_S)
         time.sleep(_REST_S)
     executor.shutdown(timeout_sec=0)

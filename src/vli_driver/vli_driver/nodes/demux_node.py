@@ -29,6 +29,9 @@ from vli_driver.demux import Demultiplexer
 from vli_driver.scanner import StripeScanner
 from vli_driver.warm_up import warm_up
 
+_PAIR = 2
+"""What an overloaded node leaves out is a long and a short image, so that those it keeps still alternate."""
+
 
 @dataclass(frozen=True)
 class InputTopics:
@@ -51,8 +54,8 @@ class DemuxNode(VliNode):
             self.advertise(topic)
         names = self.parameters.config(InputTopics)
         compressed = names.image_topic.removesuffix("/compressed") + "/compressed"
-        self.receive(IMAGE_RAW, encoded_from_message, self._on_item, names.image_topic, required=False)
-        self.receive(IMAGE_RAW_COMPRESSED, encoded_from_message, self._on_item, compressed, required=False)
+        self.receive(IMAGE_RAW, encoded_from_message, self._on_item, names.image_topic, required=False, sheds=_PAIR)
+        self.receive(IMAGE_RAW_COMPRESSED, encoded_from_message, self._on_item, compressed, required=False, sheds=_PAIR)
         self.receive(EXPOSURE, _read_exposure, self._on_item, names.exposure_topic, ends=False, required=False)
 
     def create_stage(self, calibration: Calibration | None) -> None:

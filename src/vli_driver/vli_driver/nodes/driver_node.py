@@ -122,16 +122,24 @@ class DriverNode(VliNode):
         self._begin_session(reason, stamp_ns)
 
     def _begin_session(self, reason: str, stamp_ns: int) -> None:
-        """Raise a session and wait until all have followed."""
-        number = self.raise_session(reason, stamp_ns).number
-        names = [self.get_name(), *(name.strip() for name in self._playback.wait_for.split(",") if name.strip())]
+        """Raise a session and wait until all have followed; raise another where a newer one is heard of: this is no new graph."""
         deadline_s = time.monotonic() + self._playback.wait_timeout
-        while missing := [name for name in names if not self._has_followed(name, number)]:
+        number = -1
+        while number != self.newest_session:
+            number = self.raise_session(reason, stamp_ns).number
+            self._wait_for_all(number, deadline_s)
+            time.sleep(_SETTLE_S)
+
+    def _wait_for_all(self, session: int, deadline_s: float) -> None:
+        """Return when the awaited nodes are of the session, the session is no more the newest, or it takes too long."""
+        names = [self.get_name(), *(name.strip() for name in self._playback.wait_for.split(",") if name.strip())]
+        while missing := [name for name in names if not self._has_followed(name, session)]:
+            if session != self.newest_session:
+                return
             if time.monotonic() > deadline_s:
                 self.get_logger().warning(f"playing without {', '.join(missing)}: not ready in {self._playback.wait_timeout:g} s")
-                break
+                return
             time.sleep(_POLL_S)
-        time.sleep(_SETTLE_S)
 
     def _has_followed(self, name: str, session: int) -> bool:
         status = self.others.get(name)

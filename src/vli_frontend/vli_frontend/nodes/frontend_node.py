@@ -28,6 +28,11 @@ from vli_frontend.config import FrontEndConfig
 from vli_frontend.frontend import FrontEnd
 from vli_frontend.warm_up import warm_up
 
+_IDS = 1 << 31
+"""Half of what the message holds: a session has the other half to count on."""
+_ID_PERIOD_NS = 1_000_000
+"""A thousand ids a second go by between two starts, some twenty times what a front end uses."""
+
 
 @dataclass(frozen=True)
 class InputTopics:
@@ -47,7 +52,7 @@ class FrontEndNode(VliNode):
         uses_imu = self.mode.uses_imu
         self.receive(IMU, imu_from_message, self._on_imu, self.parameters.config(InputTopics).imu_topic, uses_imu, uses_imu)
         self.receive(LASER_POINTS, scan_from_message, self._on_scan)
-        self.receive(IMAGE_LONG, lambda message: image_from_message(message, self.session), self._on_image)
+        self.receive(IMAGE_LONG, lambda message: image_from_message(message, self.session), self._on_image, sheds=1)
         self.receive(BIAS, lambda message: bias_from_message(message, self.session), self._on_bias, ends=False)
         self.receive(ODOMETRY, self._to_pose, self._on_pose, ends=False)
 
@@ -55,7 +60,9 @@ class FrontEndNode(VliNode):
         """Make the front end."""
         if calibration is not None:
             warm_up()
-            self._front_end = FrontEnd(calibration, self.parameters.config(FrontEndConfig), self.mode)
+            # Ids of a front end that is started anew must not meet those of the one before, in the back end's window.
+            first_id = self.started_ns // _ID_PERIOD_NS % _IDS
+            self._front_end = FrontEnd(calibration, self.parameters.config(FrontEndConfig), self.mode, first_id)
 
     def drop_stage(self) -> None:
         """Let go of the front end."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from sensor_msgs.msg import Image as ImageMessage
@@ -28,13 +28,15 @@ from vli_common.types import Counters, Image, LaserScan, PointCloud, WindowPoses
 from vli_mapping.config import AS_SEEN, MappingConfig
 from vli_mapping.export import write_cloud
 from vli_mapping.light import Light
-from vli_mapping.map_file import SUFFIX, load_map, save_map
+from vli_mapping.map_file import SUFFIX, load_map, map_origin, save_map
 from vli_mapping.mapper import Mapper
 from vli_mapping.mesh import make_mesh, write_mesh
 from vli_mapping.snapshot import Snapshot, restore, take
 from vli_mapping.warm_up import warm_up
 
 _MAP_PERIOD_S = 2.0
+_AUTOSAVE_CHECK_S = 0.2
+_BACK_END = WINDOW.sources[0]
 _WAITING_IMAGES = 300
 """Ten seconds of long images, as many as the mapper keeps: a scan whose images were dropped would stay grey. 280 MB at VGA."""
 
@@ -52,6 +54,9 @@ class StoreConfig:
         0.0, unit="s", minimum=0.0, maximum=86400.0, doc="save the map to autosave_path this often; 0: never"
     )
     autosave_path: str = parameter("autosave.vli", doc="file of the automatic saves: all of the map")
+    reload_autosave: bool = parameter(
+        True, doc="go on with the map in autosave_path where this node was started anew in the session that it is of"
+    )
 
 
 class MappingNode(VliNode):
@@ -66,12 +71,13 @@ class MappingNode(VliNode):
         self.receive(IMAGE_LONG, self._read_image, self._on_image, limit=_WAITING_IMAGES)
         self.receive(LASER_POINTS, scan_from_message, self._on_scan)
         self.receive(WINDOW, window_from_message, self._on_window)
-        self.serve("save", self._save)
-        self.serve("load", self._load)
-        self.serve("export", self._export)
-        self.serve("clear", self._clear)
-        self._autosave_started = threading.Lock()
-        self.create_timer(1.0, self._autosave_when_due)
+        self.serve("save", self._save, aside=True)
+        self.serve("load", self._load, aside=True)
+        self.serve("export", self._export, aside=True)
+        self.serve("clear", self._clear, aside=True)
+        self._is_resumed = False
+        self._saving = threading.Lock()
+        self.create_timer(_AUTOSAVE_CHECK_S, self._look_after_autosave)
         self._autosaved_s = time.monotonic()
         self.create_timer(_MAP_PERIOD_S, lambda: self.enqueue(self._publish_map))
 
@@ -88,6 +94,11 @@ class MappingNode(VliNode):
     def on_session(self, session: Session) -> None:
         """Begin a map."""
         self.mapper.reset(session.number)
+
+    def on_restart(self, node: str) -> None:
+        """Begin a session where the back end begins a frame of its own: its poses do not belong to the map so far."""
+        if node == _BACK_END and self._mapper is not None and (len(self._mapper.map) or self.received(WINDOW)):
+            self.raise_session(f"{node} was started anew")
 
     def on_finish(self) -> None:
         """Publish the map as it is in the end."""
@@ -156,29 +167,77 @@ class MappingNode(VliNode):
         write_mesh(path, mesh)
         return f"{len(mesh.faces)} triangles in '{path}'"
 
-    def _autosave_when_due(self) -> None:
-        """Save in a thread of its own when it is time and no save is under way."""
-        period_s = self.parameters.config(StoreConfig).autosave_s
-        if not period_s or self._mapper is None or time.monotonic() < self._autosaved_s + period_s:
-            return
-        if len(self._mapper.map) and self._autosave_started.acquire(blocking=False):
-            self._autosaved_s = time.monotonic()
-            threading.Thread(target=self._autosave, daemon=True).start()
+    def close(self) -> bool:
+        """Save a last time where the map is saved automatically, then stop."""
+        if self._is_resumed and self.parameters.config(StoreConfig).autosave_s and self._saving.acquire(blocking=False):
+            self._autosave()
+        return super().close()
+
+    @property
+    def _origin(self) -> str:
+        """Names the frame of the map: the session, of this back end; empty where the back end is not known, or elsewhere."""
+        status = self.others.get(_BACK_END)
+        if status is None or self._mapper is None or status.values.get("session") != str(self.session):
+            return ""
+        return f"session {self.session} of {_BACK_END} {status.values.get('started_ns', '')}"
+
+    def _look_after_autosave(self) -> None:
+        """Resume a predecessor's map once it is known which is the present frame; from then on save when it is time.
+
+        In a thread of its own, and never two at a time.
+        """
+        config = self.parameters.config(StoreConfig)
+        is_due = time.monotonic() > self._autosaved_s + config.autosave_s and self._mapper is not None and len(self._mapper.map)
+        job = (self._autosave if is_due else None) if self._is_resumed else (self._resume_autosave if self._origin else None)
+        if config.autosave_s and job and self._saving.acquire(blocking=False):
+            threading.Thread(target=job, daemon=True).start()
+
+    def _resume_autosave(self) -> None:
+        """Go on with the map that was saved in this session; keep one of another aside, lest the next save replaces it."""
+        path, origin = self._path("autosave_path"), self._origin
+        try:
+            saved = map_origin(path)
+            if origin and saved == origin and self.parameters.config(StoreConfig).reload_autosave:
+                snapshot = load_map(path)
+                self.call(lambda: self.mapper.resume(snapshot))
+                self.get_logger().info(f"goes on with {len(snapshot)} points from '{path}'")
+            elif path.exists():
+                kept = path.with_stem(f"{path.stem}_previous")
+                path.replace(kept)
+                self.get_logger().info(f"keeps the map of an earlier session as '{kept}'")
+        except (VliError, TimeoutError, OSError) as error:
+            self.get_logger().error(f"map of an earlier session: {error}")
+        finally:
+            self._is_resumed = True
+            self._saving.release()
 
     def _autosave(self) -> None:
+        self._autosaved_s = time.monotonic()
         path = self._path("autosave_path")
         try:
-            self._save_all(path)
+            snapshot = self._snapshot(path)
+            save_map(path, replace(snapshot, origin=self._origin))
         except (VliError, TimeoutError) as error:
             self.get_logger().error(f"automatic save: {error}", throttle_duration_sec=60.0)
         finally:
-            self._autosave_started.release()
+            self._saving.release()
 
     def _save_all(self, path: Path) -> int:
         """Write all of the map; return how many points it has."""
-        snapshot = self._snapshot(path)
-        save_map(path, snapshot)
+        snapshot = self._with_window(path)
+        save_map(path, replace(snapshot, origin=self._origin))
         return len(snapshot)
+
+    def _with_window(self, path: Path) -> Snapshot:
+        """Return the map with the scans of the window as they are now; the map itself gets them when their poses are final."""
+        waiting = self.call(self.mapper.waiting)
+        if not waiting:
+            return self._snapshot(path)
+        snapshot = take(self.mapper.map, self.call(self._settled_light), self.call)
+        whole = restore(snapshot, self.parameters.config(MappingConfig).map)
+        for stripe in waiting:
+            whole.insert(stripe)
+        return take(whole, snapshot.light)
 
     def _snapshot(self, path: Path) -> Snapshot:
         light = self.call(self._settled_light)
@@ -193,7 +252,7 @@ class MappingNode(VliNode):
 
     def _cloud(self, path: Path) -> PointCloud:
         as_seen = self.parameters.config(MappingConfig).colour == AS_SEEN
-        snapshot = self._snapshot(path)
+        snapshot = self._with_window(path)
         return restore(snapshot).cloud(light=snapshot.light, as_seen=as_seen)
 
     def _path(self, name: str) -> Path:
