@@ -206,7 +206,7 @@ def test_a_node_told_to_stop_at_any_moment_ends_with_code_0_and_no_traceback(dem
         assert code == 0 or delay_s < 3.0
 
 
-@pytest.mark.parametrize("sign", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("sign", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_a_replay_told_to_stop_writes_what_it_has(demo: Path, tmp_path: Path, sign: signal.Signals) -> None:
     out = tmp_path / "out"
     arguments = ["replay", str(demo / "bag"), "--calib", str(demo / "calibration.yaml"), "--out", str(out), "--rate", "0.3"]

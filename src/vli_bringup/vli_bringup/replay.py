@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import threading
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ from vli_bringup.output import CONFIG, SUMMARY, ResultsDirectory
 from vli_bringup.processes import GraphError, NodeProcesses
 from vli_bringup.recorder import Recorder
 from vli_bringup.settings import Settings, to_yaml
+from vli_bringup.stopping import stop_on_signals
 from vli_common.calibration import Calibration, load_calibration
 from vli_common.ply import read_cloud
 from vli_common.status import NodeState
@@ -30,6 +32,7 @@ from vli_mapping.render import write_views
 NEVER_TRACKED = 1
 _READY_S = 300.0
 _SAVE_S = 60.0
+_PAUSE_S = 1.0
 _SILENT_S = 60.0
 """A graph whose map has not grown and whose bag has not moved for this long hangs."""
 _MAP = "map.ply"
@@ -92,8 +95,11 @@ def replay(options: ReplayOptions, directory: Path, started_s: float) -> dict[st
         directory: for the results, empty.
         started_s: ``time.perf_counter()`` when the command started.
 
+    SIGINT and SIGTERM end the playback, not the command: what there is by then is written.
+
     Raises:
         GraphError: a node failed.
+        KeyboardInterrupt: told to stop before the first frame.
     """
     recorder = Recorder(options.calibration)
     parameter_file = directory / CONFIG
@@ -101,11 +107,13 @@ def replay(options: ReplayOptions, directory: Path, started_s: float) -> dict[st
     nodes = describe_graph(
         options.calibration_path, options.mode, options.imu_calibration_path, options.playback, directory / _MAP, LISTENER
     )
-    with NodeProcesses(nodes, parameter_file) as processes, GraphListener(recorder) as listener:
-        _wait_until_ready(processes, listener)
+    with stop_on_signals() as stop, NodeProcesses(nodes, parameter_file) as processes, GraphListener(recorder) as listener:
+        _wait_until_ready(processes, listener, stop)
         begin_s = time.perf_counter()
-        bag_s = _play(processes, listener)
+        bag_s = _play(processes, listener, stop)
         wall_s = time.perf_counter() - begin_s
+        if stop.is_set():
+            _hand_over(listener)
         if listener.value(_MAPPING, "points"):
             listener.call(f"{_MAPPING}/save", _SAVE_S)
     recorder.write(directory)
@@ -124,6 +132,8 @@ def replay(options: ReplayOptions, directory: Path, started_s: float) -> dict[st
         "cpu_s": round(sum(float(status.values["cpu_s"]) for status in listener.statuses.values()), 3),
         "realtime_factor": round(bag_s / wall_s, 3),
         "drops": listener.losses(),
+        "restarts": processes.restarts,
+        "interrupted_s": round(bag_s, 3) if stop.is_set() else None,
         "nodes": {name: dict(sorted(status.values.items())) for name, status in sorted(listener.statuses.items())},
     }
     (directory / SUMMARY).write_text(json.dumps(summary, indent=1) + "\n")
@@ -131,8 +141,10 @@ def replay(options: ReplayOptions, directory: Path, started_s: float) -> dict[st
 
 
 def report(summary: dict[str, Any], path: Path) -> int:
-    """Say what came out; return the exit code."""
-    if not summary["frames_with_pose"]:
+    """Say what came out; return the exit code: of a replay that was told to stop, 0 whatever came out."""
+    if summary["interrupted_s"] is not None:
+        _note(f"interrupted after {summary['interrupted_s']:.1f} s of the bag")
+    elif not summary["frames_with_pose"]:
         _note(f"tracking never started in {summary['frames_long']} long frames: {summary['reason']}")
         return NEVER_TRACKED
     if summary["drops"]:
@@ -144,23 +156,25 @@ def report(summary: dict[str, Any], path: Path) -> int:
     return 0
 
 
-def _wait_until_ready(processes: NodeProcesses, listener: GraphListener) -> None:
+def _wait_until_ready(processes: NodeProcesses, listener: GraphListener, stop: threading.Event) -> None:
     """Return when the driver has begun: every node is ready and knows its neighbours."""
     deadline_s = time.monotonic() + _READY_S
     while not listener.value(SCANNER, "position_ns") and listener.state(SCANNER) is not NodeState.FINISHED:
         processes.check()
+        if stop.is_set():
+            raise KeyboardInterrupt
         if time.monotonic() > deadline_s:
             waiting = [name for _, name in STAGES if listener.state(name) is not NodeState.READY]
             raise GraphError(f"{', '.join(waiting) or SCANNER} not ready in {_READY_S:g} s")
         listener.spin()
 
 
-def _play(processes: NodeProcesses, listener: GraphListener) -> float:
-    """Return the bag seconds played, when the last node has finished; a bar shows them on a terminal."""
+def _play(processes: NodeProcesses, listener: GraphListener, stop: threading.Event) -> float:
+    """Return the bag seconds played, when the last node has finished or all shall stop; a bar shows them on a terminal."""
     first_ns = last_ns = listener.value(SCANNER, "position_ns")
     moved_s = time.monotonic()
     with tqdm(unit="s", disable=not sys.stderr.isatty(), leave=False) as bar:
-        while listener.state(_MAPPING) is not NodeState.FINISHED:
+        while listener.state(_MAPPING) is not NodeState.FINISHED and not stop.is_set():
             processes.check()
             listener.spin()
             position_ns = listener.value(SCANNER, "position_ns")
@@ -171,6 +185,14 @@ def _play(processes: NodeProcesses, listener: GraphListener) -> float:
                 raise GraphError(f"the graph has not moved for {_SILENT_S:g} s: {states}")
             bar.update(max(0.0, round((last_ns - first_ns) / NANOSECONDS, 1) - bar.n))
     return (last_ns - first_ns) / NANOSECONDS
+
+
+def _hand_over(listener: GraphListener) -> None:
+    """Let the back end hand over its window before the map is saved, as at the end of the bag."""
+    listener.call(f"{_BACK_END}/pause", _PAUSE_S)
+    deadline_s = time.monotonic() + _PAUSE_S
+    while listener.state(_BACK_END) is not NodeState.PAUSED and time.monotonic() < deadline_s:
+        listener.spin()
 
 
 def _rate(text: str) -> float:
