@@ -10,9 +10,14 @@ import numpy as np
 
 from vli_common.arrays import FloatArray, IntArray
 from vli_common.types import NANOSECONDS, Counters, Image, ImuSample
+from vli_frontend.imu_gaps import HOLE, period_ns
 
 _CAPACITY = 8192
 _MAX_WAITING = 32
+_RECENT = 32
+"""Samples that tell the period."""
+_LATEST_NS = NANOSECONDS // 10
+"""How far behind the newest sample one may come and still be used."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +62,11 @@ class ImuHistory:
         """Newest stamp, IMU clock."""
         return int(self._stamps[self._count - 1]) if self._count else None
 
+    @property
+    def oldest_ns(self) -> int:
+        """Oldest stamp, IMU clock; there must be samples."""
+        return int(self._stamps[0])
+
     def first_from(self, stamp_ns: int) -> int | None:
         """Return the first stamp at or after ``stamp_ns``."""
         index = int(np.searchsorted(self._stamps[: self._count], stamp_ns, side="left"))
@@ -64,12 +74,36 @@ class ImuHistory:
 
     def append(self, sample: ImuSample) -> None:
         """Add a sample newer than all others."""
+        self._make_room()
+        self._put(self._count, sample)
+
+    def insert(self, sample: ImuSample) -> bool:
+        """Put a sample that comes late where it belongs, after the oldest; False where its stamp is there already."""
+        self._make_room()
+        at = int(np.searchsorted(self._stamps[: self._count], sample.stamp_ns))
+        if self._stamps[at] == sample.stamp_ns:
+            return False
+        behind, moved = slice(at, self._count), slice(at + 1, self._count + 1)
+        self._stamps[moved], self._values[moved] = self._stamps[behind].copy(), self._values[behind].copy()
+        self._put(at, sample)
+        return True
+
+    def _make_room(self) -> None:
         if self._count == len(self._stamps):
             self._stamps[:_CAPACITY], self._values[:_CAPACITY] = self._stamps[_CAPACITY:], self._values[_CAPACITY:]
             self._count = _CAPACITY
-        self._stamps[self._count] = sample.stamp_ns
-        self._values[self._count, :3], self._values[self._count, 3:] = sample.gyro, sample.accel
+
+    def _put(self, at: int, sample: ImuSample) -> None:
+        self._stamps[at] = sample.stamp_ns
+        self._values[at, :3], self._values[at, 3:] = sample.gyro, sample.accel
         self._count += 1
+
+    def has_hole_at_end(self, stamp_ns: int) -> bool:
+        """Return whether only the newest sample lies at or after a stamp, and one before it may still be on its way."""
+        recent = self._stamps[max(0, self._count - _RECENT) : self._count]
+        if len(recent) < _RECENT or recent[-2] >= stamp_ns:
+            return False
+        return bool(recent[-1] - recent[-2] > HOLE * period_ns(recent))
 
     def clear(self) -> None:
         """Forget all samples."""
@@ -121,9 +155,11 @@ class ReadyFrame:
 class Synchroniser:
     """Holds long frames until the IMU covers them; keeps both in strict order.
 
-    What is out of order, duplicated or not finite is dropped and counted. A frame waits at most ``max_wait_ns`` of data time (of
-    IMU or of later frames): then it goes on without the IMU, so that a dead IMU does not stop the camera, and no result depends
-    on what comes later.
+    An IMU sample that comes late is put where it belongs, and where one seems to be missing just before a frame, the next is
+    awaited. Frames out of order, and what is duplicated, too late or not finite, are dropped and counted.
+
+    A frame waits at most ``max_wait_ns`` of data time (of IMU or of later frames): then it goes on without the IMU, so that a
+    dead IMU does not stop the camera, and no result depends on what comes later.
 
     Args:
         timeshift_ns: ``t_imu = t_cam + timeshift``.
@@ -152,9 +188,14 @@ class Synchroniser:
         if not (np.isfinite(sample.gyro).all() and np.isfinite(sample.accel).all()):
             return self._drop("imu_not_finite")
         newest = self.imu.newest_ns
-        if newest is not None and sample.stamp_ns <= newest:
-            return self._drop("imu_duplicate" if sample.stamp_ns == newest else "imu_out_of_order")
-        self.imu.append(sample)
+        if newest is None or sample.stamp_ns > newest:
+            self.imu.append(sample)
+            return True
+        if sample.stamp_ns < max(newest - _LATEST_NS, self.imu.oldest_ns):
+            return self._drop("imu_too_late")
+        if not self.imu.insert(sample):
+            return self._drop("imu_duplicate")
+        self._counters.add("imu_out_of_order")
         return True
 
     def add_frame(self, image: Image) -> bool:
@@ -179,6 +220,8 @@ class Synchroniser:
         deadline_ns = stamp_ns + self._max_wait_ns
         next_ns = self.imu.first_from(stamp_ns)
         if next_ns is not None and next_ns <= deadline_ns:
+            if self.imu.has_hole_at_end(stamp_ns) and self.to_imu_clock(self._waiting[-1].stamp_ns) <= deadline_ns:
+                return Waiting.IMU_BEHIND
             return ReadyFrame(self._waiting.popleft(), covered=True)
         if next_ns is not None or self.to_imu_clock(self._waiting[-1].stamp_ns) > deadline_ns:
             self._counters.add("frames_without_imu")

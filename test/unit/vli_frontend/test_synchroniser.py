@@ -86,9 +86,7 @@ def test_a_sample_after_a_long_gap_does_not_count_as_cover(synchroniser: Synchro
     assert covered_stamps(synchroniser) == [(100 * MS, False)]
 
 
-def test_what_is_out_of_order_duplicated_or_not_finite_is_dropped_and_counted(
-    synchroniser: Synchroniser, counters: Counters
-) -> None:
+def test_what_is_too_late_duplicated_or_not_finite_is_dropped_and_counted(synchroniser: Synchroniser, counters: Counters) -> None:
     assert synchroniser.add_imu(sample(10 * MS))
     assert not synchroniser.add_imu(sample(10 * MS))
     assert not synchroniser.add_imu(sample(5 * MS))
@@ -99,12 +97,57 @@ def test_what_is_out_of_order_duplicated_or_not_finite_is_dropped_and_counted(
     assert not synchroniser.add_frame(image(9 * MS))
     assert counters.values == {
         "imu_duplicate": 1,
-        "imu_out_of_order": 1,
+        "imu_too_late": 1,
         "imu_not_finite": 2,
         "frames_duplicate": 1,
         "frames_out_of_order": 1,
     }
     assert synchroniser.imu.newest_ns == 10 * MS
+
+
+def test_a_late_sample_is_put_where_it_belongs(synchroniser: Synchroniser, counters: Counters) -> None:
+    in_order, history = ImuHistory(), synchroniser.imu
+    for k in range(60):
+        in_order.append(sample(5 * k * MS, float(k)))
+    for k in (0, 1, 3, 2, *range(5, 12), 4, *range(12, 60)):
+        assert synchroniser.add_imu(sample(5 * k * MS, float(k)))
+    assert counters.values == {"imu_out_of_order": 2}
+    assert not synchroniser.add_imu(sample(0))
+    assert counters["imu_too_late"] == 1
+    expected, found = in_order.segment(3 * MS, 290 * MS), history.segment(3 * MS, 290 * MS)
+    assert expected is not None
+    assert found is not None
+    np.testing.assert_array_equal(found.stamps, expected.stamps)
+    np.testing.assert_array_equal(found.gyro, expected.gyro)
+
+
+def test_a_frame_waits_for_the_sample_that_seems_to_be_missing_before_it(synchroniser: Synchroniser) -> None:
+    for k in range(40):
+        synchroniser.add_imu(sample(5 * k * MS))
+    synchroniser.add_frame(image(198 * MS))
+    synchroniser.add_imu(sample(205 * MS))
+    assert synchroniser.next() is Waiting.IMU_BEHIND
+    synchroniser.add_imu(sample(200 * MS))
+    assert covered_stamps(synchroniser) == [(198 * MS, True)]
+
+
+def test_a_frame_does_not_wait_for_a_sample_that_is_lost(synchroniser: Synchroniser) -> None:
+    for k in range(40):
+        synchroniser.add_imu(sample(5 * k * MS))
+    synchroniser.add_frame(image(198 * MS))
+    synchroniser.add_imu(sample(205 * MS))
+    synchroniser.add_imu(sample(210 * MS))
+    assert covered_stamps(synchroniser) == [(198 * MS, True)]
+
+
+def test_late_samples_find_their_place_in_a_full_history() -> None:
+    history = ImuHistory()
+    for k in range(16_384):
+        history.append(sample(10 * k * MS, float(k)))
+    assert history.insert(sample(163_815 * MS, 0.5))
+    segment = history.segment(163_810 * MS, 163_820 * MS)
+    assert segment is not None
+    np.testing.assert_allclose(segment.gyro[:, 0], [16_381, 0.5, 16_382])
 
 
 def test_too_many_waiting_frames_lose_the_oldest(counters: Counters) -> None:
