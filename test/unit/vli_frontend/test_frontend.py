@@ -215,7 +215,9 @@ def test_two_runs_are_identical_also_after_a_reset(items: Items, outputs: list[F
         np.testing.assert_array_equal(first.tracks.flags, second.tracks.flags)
 
 
-def test_imu_samples_that_are_stale_or_come_twice_change_nothing_but_a_counter(items: Items, outputs: list[FrontEndOutput]) -> None:
+def test_imu_samples_that_are_stale_or_come_twice_change_nothing_but_a_counter(
+    items: Items, outputs: list[FrontEndOutput]
+) -> None:
     disturbed: Items = []
     for k, item in enumerate(items):
         disturbed.append(item)
