@@ -20,6 +20,7 @@ import yaml
 from vli_bringup.graph import NodeDescription
 from vli_common.errors import VliError
 from vli_common.node.main import STOP_WITH_PARENT
+from vli_common.node.transport import remove_dead_segments
 
 MAX_RESTARTS = 3
 """Of one node within a minute."""
@@ -82,6 +83,7 @@ class NodeProcesses:
             _wait(running, time.monotonic() + _STOP_S)
         for child in self._children.values():
             child.log.close()
+        remove_dead_segments()
         self._directory.cleanup()
 
     def check(self) -> None:
@@ -103,6 +105,7 @@ class NodeProcesses:
             child.recent.append(now_s)
             child.restarts += 1
             child.log.close()
+            remove_dead_segments()
             child.process, child.log = _start(child.arguments)
             self._tell(f"{name} crashed and is started again: {told}")
 

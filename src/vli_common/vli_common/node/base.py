@@ -81,6 +81,7 @@ class VliNode(ManagedNode):
         self.is_behind = False
         """True where the message that is being handled came too long ago, and those before it too: leave out what can be."""
         self._inputs: dict[str, Input] = {}
+        self._told_unmatched = ""
         self._matchers: list[Callable[[], str | None]] = []
         self._publishers_by_topic: dict[str, Publisher] = {}
         self._sent = Counters()
@@ -339,10 +340,21 @@ class VliNode(ManagedNode):
         self.create_subscription(String, CALIBRATION.name, self._on_calibration, quality(CALIBRATION))
         self.create_timer(_STATUS_PERIOD_S, self.publish_status)
         self.create_timer(_FINISH_PERIOD_S, self._check_finish)
+        self.create_timer(_FINISH_PERIOD_S, self._tell_links)
         self.create_timer(_STATUS_PERIOD_S, self._match)
         self.serve("reset", lambda: f"session {self.raise_session(f'reset of {self.get_name()}').number}")
         self.serve("pause", self._pause)
         self.serve("resume", self._resume)
+
+    def _tell_links(self) -> None:
+        """Say at once when an input finds its publisher, or loses it: others wait for that."""
+        unmatched = self._unmatched()
+        if unmatched != self._told_unmatched:
+            self._told_unmatched = unmatched
+            self.publish_status()
+
+    def _unmatched(self) -> str:
+        return ",".join(entry.name for entry in self._inputs.values() if entry.is_unmatched)
 
     def _match(self) -> None:
         for match in self._matchers:
@@ -523,8 +535,7 @@ class VliNode(ManagedNode):
         )
 
     def _figures(self) -> dict[str, str]:
-        unmatched = [entry.name for entry in self._inputs.values() if entry.is_unmatched]
-        figures = {"unmatched": ",".join(unmatched), "cpu_s": f"{time.process_time():.2f}"}
+        figures = {"unmatched": self._unmatched(), "cpu_s": f"{time.process_time():.2f}"}
         for name, entry in self._inputs.items():
             figures |= entry.figures(self._worker.waiting(name))
         percentiles = self.latency.percentiles_ms()

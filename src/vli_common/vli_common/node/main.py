@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import faulthandler
 import os
-import signal
 import sys
 import threading
 import time
@@ -17,6 +16,7 @@ from rclpy.signals import SignalHandlerOptions
 from vli_common.errors import VliError
 from vli_common.node.base import VliNode
 from vli_common.node.transport import set_transport_profile
+from vli_common.stop_signals import STOP, take_over
 
 _SWITCH_S = 2e-4
 """The executor asks for the interpreter for every message. At Python's default of 5 ms, 260 messages a second would take longer
@@ -41,9 +41,9 @@ def run_node(factory: Callable[[], VliNode]) -> int:
     """
     sys.setswitchinterval(_SWITCH_S)
     set_transport_profile()
-    stop = _stop_on_signals()
+    take_over()
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    code, stopped = _run(factory, stop)
+    code, stopped = _run(factory)
     rclpy.try_shutdown()
     if not stopped:
         # A kernel that is being compiled cannot be interrupted, and an interpreter must not end under it.
@@ -53,8 +53,10 @@ def run_node(factory: Callable[[], VliNode]) -> int:
     return code
 
 
-def _run(factory: Callable[[], VliNode], stop: threading.Event) -> tuple[int, bool]:
+def _run(factory: Callable[[], VliNode]) -> tuple[int, bool]:
     """Return the exit code, and whether the node's own threads have ended."""
+    if STOP.is_set():
+        return 0, True
     try:
         node = factory()
     except VliError as error:
@@ -63,7 +65,7 @@ def _run(factory: Callable[[], VliNode], stop: threading.Event) -> tuple[int, bo
     code = 0
     try:
         node.start()
-        _spin(node, stop)
+        _spin(node)
     except VliError as error:
         code = _UNUSABLE
         sys.stderr.write(f"{error}\n")
@@ -80,23 +82,11 @@ def _limit_teardown(code: int) -> None:
     faulthandler.dump_traceback_later(2 * _TEARDOWN_S, exit=True)
 
 
-def _spin(node: VliNode, stop: threading.Event) -> None:
+def _spin(node: VliNode) -> None:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     parent = os.getppid() if os.environ.get(STOP_WITH_PARENT) else None
-    while not (stop.is_set() or node.failure or node.is_shut_down or parent not in (None, os.getppid())):
+    while not (STOP.is_set() or node.failure or node.is_shut_down or parent not in (None, os.getppid())):
         executor.spin_once(timeout_sec=_SIGNAL_S)
         time.sleep(_REST_S)
     executor.shutdown(timeout_sec=0)
-
-
-def _stop_on_signals() -> threading.Event:
-    """Return what SIGINT and SIGTERM set.
-
-    A handler that raises (Python's own, and rclpy's shutdown) can do so in the middle of a constructor or a callback, and what it
-    leaves half made complains on standard error when it is collected.
-    """
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
-    return stop

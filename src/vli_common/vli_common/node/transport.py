@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import fcntl
 import importlib
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,7 @@ from vli_common.topics import Topic
 
 _PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 _READER_FACTOR = 8
+_SEGMENT_LOCK = re.compile(r"fastrtps_[0-9a-f]{16}_el")
 LOCAL_PROFILE = Path(__file__).with_name("fastdds_local.xml")
 NETWORK_PROFILE = Path(__file__).with_name("fastdds_network.xml")
 
@@ -23,6 +26,30 @@ def set_transport_profile(profile: Path = LOCAL_PROFILE) -> None:
     """Let Fast DDS use ``profile`` unless the environment names one already; call before ``rclpy.init``."""
     if not any(os.environ.get(name) for name in _PROFILE_VARIABLES):
         os.environ[_PROFILE_VARIABLES[0]] = str(profile)
+
+
+def remove_dead_segments(directory: Path = Path("/dev/shm")) -> int:
+    """Remove the shared memory of Fast DDS that killed processes have left, as ``fastdds shm clean`` does; return how many.
+
+    A process that lives holds a lock on ``fastrtps_ID_el`` beside its segment ``fastrtps_ID``. One that is killed leaves both.
+    """
+    removed = 0
+    for lock in directory.glob("fastrtps_*_el"):
+        if _SEGMENT_LOCK.fullmatch(lock.name) and not _is_locked(lock):
+            for path in (lock.with_name(lock.name.removesuffix("_el")), lock):
+                path.unlink(missing_ok=True)
+            removed += 1
+    return removed
+
+
+def _is_locked(path: Path) -> bool:
+    """Return True where a process holds the lock, or it is not ours to ask."""
+    try:
+        with path.open("r+b") as stream:
+            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    return False
 
 
 def quality(topic: Topic, reading: bool = False) -> QoSProfile:

@@ -1,1 +1,5 @@
 """The driver's nodes: sources, and demultiplexer with stripe detector."""
+
+from vli_common.stop_signals import take_over_in_nodes
+
+take_over_in_nodes(__name__)

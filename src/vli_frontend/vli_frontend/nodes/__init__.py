@@ -1,1 +1,5 @@
 """The front end as a node."""
+
+from vli_common.stop_signals import take_over_in_nodes
+
+take_over_in_nodes(__name__)

@@ -1,0 +1,31 @@
+"""SIGINT and SIGTERM set an event, from the first line of a node on.
+
+Loading a node takes a second or two. A signal in that time would end it with the traceback of whatever was being imported, and in
+the middle of a C extension with an ImportError. A handler that raises can also do so in the middle of a constructor or a callback,
+and what it leaves half made complains on standard error when it is collected.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from pathlib import Path
+
+STOP = threading.Event()
+"""Set by the first signal."""
+
+
+def take_over() -> None:
+    """Let the signals set :data:`STOP`; call in the main thread."""
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: STOP.set())
+
+
+def take_over_in_nodes(package: str) -> None:
+    """Call :func:`take_over` where this process was started to run a node of ``package``, and not where one is only imported."""
+    started = sys.orig_argv[1:3]
+    is_module = started[:1] == ["-m"] and started[-1].startswith(f"{package}.")
+    is_script = Path(sys.argv[0]).name.endswith("_node")
+    if (is_module or is_script) and threading.current_thread() is threading.main_thread():
+        take_over()
