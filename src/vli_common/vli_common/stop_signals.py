@@ -1,8 +1,8 @@
 """SIGINT and SIGTERM set an event, from the first line of a node on.
 
-Loading a node takes a second or two. A signal in that time would end it with the traceback of whatever was being imported, and in
-the middle of a C extension with an ImportError. A handler that raises can also do so in the middle of a constructor or a callback,
-and what it leaves half made complains on standard error when it is collected.
+Loading a node takes a second or two. A signal in that time would end it with the traceback of whatever was being imported, and
+in the middle of a C extension with an ImportError. A handler that raises can also do so in the middle of a constructor or a
+callback, and what it leaves half made complains on standard error when it is collected.
 """
 
 from __future__ import annotations
