@@ -20,6 +20,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "simulate": ("vli_simulation.cli", "make a bag with truth"),
     "calibrate": ("vli_calibration.cli", "camera, laser plane, IMU: make a calibration and say what it is worth"),
     "record": ("vli_bringup.record", "what the scanner sends, to a bag"),
+    "view": ("vli_bringup.view", "results, a bag or a running scan, in a browser"),
     "doctor": ("vli_bringup.doctor", "is a bag, or a live sensor, fit for a scan? say what to change"),
     "export": ("vli_bringup.export", "a map to a cloud (.ply .pcd .las .laz .e57) or a mesh (.stl .obj .glb, .ply with --mesh)"),
     "merge": ("vli_bringup.merge", "several saved maps that overlap, aligned, to one"),

@@ -8,8 +8,8 @@ from typing import Any
 from vli_common.errors import OutputError
 
 
-def optional(module: str, extra: str) -> Any:
-    """Return a module of an extra of this package.
+def optional(module: str, extra: str, package: str = "vli_mapping") -> Any:
+    """Return a module of an extra of a package, by default this one.
 
     Raises:
         OutputError: it is not installed.
@@ -19,5 +19,5 @@ def optional(module: str, extra: str) -> Any:
     except ImportError as error:
         library = module.partition(".")[0]
         raise OutputError(
-            f"this needs '{library}', which cannot be imported ({error}); install it with: pip install 'vli_mapping[{extra}]'"
+            f"this needs '{library}', which cannot be imported ({error}); install it with: pip install '{package}[{extra}]'"
         ) from error
