@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sqlite3
 import struct
 import zlib
@@ -18,7 +19,10 @@ _FRAME = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 _CHUNK = struct.Struct("<QQQII")
 _SCHEMA, _CHANNEL, _MESSAGE_OP, _CHUNK_OP, _MESSAGE_INDEX, _DATA_END = 0x03, 0x04, 0x05, 0x06, 0x07, 0x0F
+_INDEX = struct.Struct("<HI")
 _RUN_BYTES = 4 << 20
+_MAX_CHUNK_BYTES = 1 << 28
+"""Uncompressed. Writers close a chunk after some megabytes; a record that claims more is rotten, or a trap."""
 
 
 class RawMessage(NamedTuple):
@@ -120,8 +124,8 @@ class McapFile:
                 segments += run.close() + _chunk_segment(stream, body, length, end)
             elif opcode in (_SCHEMA, _CHANNEL, _MESSAGE_OP) and following <= end:
                 segments += run.add(stream, opcode, offset, following)
-            elif opcode == _MESSAGE_INDEX and following <= end:
-                channel, size = struct.unpack("<HI", stream.read(6))
+            elif opcode == _MESSAGE_INDEX and following <= end and length >= _INDEX.size:
+                channel, size = _INDEX.unpack(stream.read(_INDEX.size))
                 self._index_counts[channel] = self._index_counts.get(channel, 0) + size // 16
             if following > end:
                 break
@@ -157,14 +161,15 @@ class McapFile:
         return counts
 
     def _note(self, opcode: int, body: memoryview) -> None:
-        """Remember a schema or channel record."""
-        if opcode == _SCHEMA:
-            self._schemas[struct.unpack_from("<H", body)[0]] = _string(body, 2)
-        elif opcode == _CHANNEL:
-            channel, schema = struct.unpack_from("<HH", body)
-            topic = _string(body, 4)
-            self._channels[channel] = topic
-            self.topics.setdefault(topic, TopicInfo(self._schemas.get(schema, "")))
+        """Remember a schema or channel record; one that is too short to be any is passed over."""
+        with contextlib.suppress(struct.error):
+            if opcode == _SCHEMA:
+                self._schemas[struct.unpack_from("<H", body)[0]] = _string(body, 2)
+            elif opcode == _CHANNEL:
+                channel, schema = struct.unpack_from("<HH", body)
+                topic = _string(body, 4)
+                self._channels[channel] = topic
+                self.topics.setdefault(topic, TopicInfo(self._schemas.get(schema, "")))
 
     def _read_segment(self, stream: BinaryIO, segment: _Segment, wanted: dict[int, str]) -> list[RawMessage]:
         found: list[RawMessage] = []
@@ -212,8 +217,9 @@ class _Run:
         if self._end == 0:
             self._offset = offset
         self._end = following
-        if opcode == _MESSAGE_OP:
-            self._times.append(_MESSAGE.unpack(stream.read(_MESSAGE.size))[2])
+        head = stream.read(_MESSAGE.size) if opcode == _MESSAGE_OP else b""
+        if len(head) == _MESSAGE.size:
+            self._times.append(_MESSAGE.unpack(head)[2])
         return self.close() if self._end - self._offset > _RUN_BYTES else []
 
     def close(self) -> list[_Segment]:
@@ -294,27 +300,41 @@ def _decompress(data: bytes, segment: _Segment) -> bytes:
     """Return the uncompressed, checked records of a chunk.
 
     Raises:
-        ValueError: it cannot be decompressed, or fails its checksum.
+        ValueError: it cannot be decompressed, claims an impossible size, or fails its checksum.
     """
+    if segment.size > _MAX_CHUNK_BYTES:
+        raise ValueError(f"it claims '{segment.size}' bytes, expected at most {_MAX_CHUNK_BYTES}")
     if segment.compression == "zstd":
-        import zstandard
-
-        try:
-            data = zstandard.decompress(data, segment.size)
-        except zstandard.ZstdError as error:
-            raise ValueError(str(error)) from error
+        data = _unzstd(data, segment.size)
     elif segment.compression == "lz4":
-        import lz4.frame  # type: ignore[import-untyped]
-
-        try:
-            data = lz4.frame.decompress(data)
-        except RuntimeError as error:
-            raise ValueError(str(error)) from error
+        data = _unlz4(data, segment.size)
     elif segment.compression:
         raise ValueError(f"unknown compression '{segment.compression}', expected zstd, lz4 or none")
     if segment.crc and zlib.crc32(data) != segment.crc:
         raise ValueError("checksum mismatch")
     return data
+
+
+def _unzstd(data: bytes, size: int) -> bytes:
+    import zstandard
+
+    try:
+        claimed = zstandard.get_frame_parameters(data).content_size
+        if claimed not in (zstandard.CONTENTSIZE_UNKNOWN, size):
+            raise ValueError(f"it holds '{claimed}' bytes, expected {size}")
+        return zstandard.decompress(data, size)
+    except (zstandard.ZstdError, MemoryError) as error:
+        raise ValueError(str(error)) from error
+
+
+def _unlz4(data: bytes, size: int) -> bytes:
+    import lz4.frame  # type: ignore[import-untyped]
+
+    try:
+        out: bytes = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size)
+    except (RuntimeError, MemoryError) as error:
+        raise ValueError(str(error)) from error
+    return out
 
 
 def _records(data: bytes) -> Iterator[tuple[int, memoryview]]:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import struct
+import tracemalloc
+import zlib
+
 import cv2
 import numpy as np
 import pytest
@@ -120,3 +124,39 @@ def test_stamp_and_exposure_are_kept() -> None:
 def test_what_cannot_be_decoded_is_said(image: EncodedImage, message: str) -> None:
     with pytest.raises(InputError, match=message):
         decode(image)
+
+
+def png_part(name: bytes, body: bytes, length: int | None = None) -> bytes:
+    checked = name + body
+    return struct.pack(">I", len(body) if length is None else length) + checked + struct.pack(">I", zlib.crc32(checked))
+
+
+def png_of(width: int, height: int, *parts: bytes) -> bytes:
+    return b"\x89PNG\r\n\x1a\n" + png_part(b"IHDR", struct.pack(">II5B", width, height, 8, 2, 0, 0, 0)) + b"".join(parts)
+
+
+def jpeg_of(width: int, height: int) -> bytes:
+    data = bytearray(packed("jpeg", ".jpg", colour_image()).data)
+    at = data.index(b"\xff\xc0") + 5
+    data[at : at + 4] = struct.pack(">HH", height, width)
+    return bytes(data)
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (png_of(50_000, 50_000, png_part(b"IDAT", zlib.compress(b""))), "claims to be '50000 x 50000', expected at most"),
+        (png_of(2**31 - 1, 2**31 - 1), "claims to be '2147483647 x 2147483647'"),
+        (png_of(4, 4, png_part(b"IDAT", b"", length=2**31 - 1)), "is cut: a part of it has '2147483647' bytes"),
+        (png_of(4, 4, png_part(b"junk", b"x" * 9)), "is broken"),
+        (b"\x89PNG\r\n\x1a\n" + png_part(b"IDAT", b"x" * 30), "is broken: it has no header"),
+        (jpeg_of(65_500, 65_500), "claims to be '65500 x 65500', expected at most"),
+    ],
+    ids=["png of 2.5 Gpx", "png of 4 Epx", "part of 2 GB", "no data", "no header", "jpeg of 4 Gpx"],
+)
+def test_an_image_that_claims_more_than_it_can_be_takes_no_memory(data: bytes, message: str) -> None:
+    tracemalloc.start()
+    with pytest.raises(InputError, match=message):
+        decode(EncodedImage(1, data, "x", compressed=True))
+    assert tracemalloc.get_traced_memory()[1] < 2**20
+    tracemalloc.stop()
