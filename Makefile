@@ -15,7 +15,7 @@ REDUCE := import sys, cv2; whole = cv2.imread(sys.argv[1]); \
 # Tests start ROS graphs of their own: they must not meet those of others on the network.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 
-.PHONY: demo test test-all lint format bench bench-estimator bench-goals bench-calibration bench-scenes pictures calibration-pictures venv config lock clean
+.PHONY: demo test test-all lint format bench bench-estimator bench-goals bench-graph bench-calibration bench-scenes pictures calibration-pictures venv config lock clean
 
 demo: venv
 	$(BIN)/vli demo
@@ -55,7 +55,7 @@ format: venv
 
 bench: venv
 	$(BIN)/python -m pytest -m perf -q test/perf
-	@for script in $(filter-out %/bench_estimator.py,$(wildcard test/perf/bench_*.py)); do \
+	@for script in $(filter-out %/bench_estimator.py %/bench_graph.py,$(wildcard test/perf/bench_*.py)); do \
 		echo "== $$script"; \
 		test -d $(RECORDING) || { echo "skipped: needs the recording '$(RECORDING)'"; continue; }; \
 		$(BIN)/python $$script || failed=1; \
@@ -76,6 +76,10 @@ bench-estimator: venv
 # Accuracy against the project's goals; makes its recordings first.
 bench-goals: venv
 	$(BIN)/python test/perf/goals.py
+
+# The node graph against its bars: losses, latency, pace, overhead, crashes, stops, and 30 minutes of soak.
+bench-graph: venv
+	$(BIN)/python test/perf/bench_graph.py
 
 # The whole table of real and simulated sets; under an hour on two idle cores.
 bench-calibration: venv

@@ -96,7 +96,7 @@ class NodeProcesses:
             code = child.process.poll()
             if code is None:
                 continue
-            told = _last_line(child.log) or f"{name} ended with code '{code}' and said nothing"
+            told = _cause(name, code, child.log)
             if not child.node.respawn or code in _FINAL_CODES:
                 raise GraphError(told)
             now_s = time.monotonic()
@@ -107,7 +107,12 @@ class NodeProcesses:
             child.log.close()
             remove_dead_segments()
             child.process, child.log = _start(child.arguments)
-            self._tell(f"{name} crashed and is started again: {told}")
+            self._tell(f"{told}; it is started again")
+
+    def forgive(self) -> None:
+        """Count the crashes that end the graph anew, for who kills nodes on purpose."""
+        for child in self._children.values():
+            child.recent.clear()
 
     @property
     def pids(self) -> dict[str, int]:
@@ -137,6 +142,13 @@ def _wait(processes: list[subprocess.Popen[bytes]], deadline_s: float) -> None:
             process.wait(max(0.0, deadline_s - time.monotonic()))
         except subprocess.TimeoutExpired:
             continue
+
+
+def _cause(name: str, code: int, log: IO[bytes]) -> str:
+    """Return why a node ended: its own last line, unless it had no time to say one."""
+    if code < 0:
+        return f"{name} was ended by {signal.Signals(-code).name}"
+    return _last_line(log) or f"{name} ended with code '{code}' and said nothing"
 
 
 def _last_line(log: IO[bytes]) -> str:

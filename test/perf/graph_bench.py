@@ -1,0 +1,261 @@
+"""A graph under measurement: started over a bag, watched from outside; and what the same bag costs offline."""
+
+from __future__ import annotations
+
+import os
+import struct
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vli_bringup.graph import SCANNER, NodeDescription, Playback, describe_graph
+from vli_bringup.listener import LISTENER, GraphListener
+from vli_bringup.pipeline import Pipeline, Stages
+from vli_bringup.processes import GraphError, NodeProcesses
+from vli_bringup.recorder import Recorder
+from vli_bringup.settings import Settings, to_yaml
+from vli_bringup.trajectory_metrics import associate, rms, trajectory_errors
+from vli_bringup.tum import Trajectory
+from vli_bringup.warm_up import warm_up
+from vli_common.arrays import FloatArray
+from vli_common.calibration import Calibration, load_calibration
+from vli_common.node.transport import message_type, quality
+from vli_common.status import NodeState
+from vli_common.topics import IMAGE_RAW_COMPRESSED, POSE, Topic
+from vli_common.types import NANOSECONDS, EncodedImage, Mode
+from vli_driver.bag import BagReader, BagTopics
+from vli_driver.decode import decode
+
+NODES = [node.executable for node in describe_graph(Path("none"))]
+MAPPING = "mapping_node"
+_START_S = 300.0
+_STAMP = struct.Struct("<iI")
+_CDR_HEADER = 4
+_PAGE = os.sysconf("SC_PAGE_SIZE")
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A directory with ``bag`` and ``calibration.yaml``, perhaps ``truth.tum``."""
+
+    directory: Path
+
+    @property
+    def bag(self) -> Path:
+        """The bag to play."""
+        return self.directory / "bag"
+
+    @property
+    def calibration_path(self) -> Path:
+        """The calibration the driver publishes."""
+        return self.directory / "calibration.yaml"
+
+    @property
+    def calibration(self) -> Calibration:
+        """The same, read."""
+        return load_calibration(self.calibration_path)
+
+
+class Meter:
+    """When each long frame was published and when its pose came, by this process's clock.
+
+    Args:
+        listener: in the graph.
+    """
+
+    def __init__(self, listener: GraphListener) -> None:
+        self.published_s: dict[int, float] = {}
+        self.posed_s: dict[int, float] = {}
+        for topic, times in ((IMAGE_RAW_COMPRESSED, self.published_s), (POSE, self.posed_s)):
+            self._subscribe(listener, topic, times)
+
+    def latencies_ms(self, since_s: float = 0.0) -> FloatArray:
+        """Return the time (N,) from image to pose of every frame posed since, in order."""
+        both = [
+            (self.published_s[stamp], at) for stamp, at in self.posed_s.items() if stamp in self.published_s and at >= since_s
+        ]
+        return 1e3 * np.array([posed - published for published, posed in both])
+
+    @staticmethod
+    def _subscribe(listener: GraphListener, topic: Topic, times: dict[int, float]) -> None:
+        def note(serialised: bytes) -> None:
+            seconds, nanoseconds = _STAMP.unpack_from(serialised, _CDR_HEADER)
+            times[seconds * NANOSECONDS + nanoseconds] = time.monotonic()
+
+        listener.node.create_subscription(message_type(topic), topic.name, note, quality(topic, reading=True), raw=True)
+
+
+@dataclass
+class Graph:
+    """A running graph and who watches it."""
+
+    processes: NodeProcesses
+    listener: GraphListener
+    recorder: Recorder
+    meter: Meter
+
+    def wait(self, condition: Callable[[], bool], timeout_s: float = _START_S) -> float:
+        """Spin until a condition holds; return the seconds that took.
+
+        Raises:
+            GraphError: it does not hold in time, or a node ended for good.
+        """
+        begin_s = time.monotonic()
+        while not condition():
+            self.processes.check()
+            if time.monotonic() - begin_s > timeout_s:
+                states = {name: status.state.value for name, status in self.listener.statuses.items()}
+                raise GraphError(f"waited for {timeout_s:g} s in vain: {states}")
+            self.listener.spin()
+        return time.monotonic() - begin_s
+
+    def wait_for_frames(self) -> None:
+        """Return when the driver has begun to play."""
+        self.wait(lambda: self.listener.value(SCANNER, "position_ns") > 0)
+
+    def play(self) -> None:
+        """Return when the last node has finished."""
+        self.wait_for_frames()
+        self.wait(lambda: self.listener.state(MAPPING) is NodeState.FINISHED, 3600.0)
+
+    def value(self, node: str, name: str) -> float:
+        """Return a number of the newest status of a node, 0 where it has none."""
+        status = self.listener.statuses.get(node)
+        return float(status.values.get(name, "0") or 0) if status else 0.0
+
+    def is_linked(self, node: str, since_ns: int) -> bool:
+        """Return True where a node that was killed at a wall clock time works again, in one session with the others."""
+        statuses = [self.listener.statuses.get(name) for name in NODES]
+        if self.value(node, "started_ns") <= since_ns or None in statuses:
+            return False
+        if node == SCANNER and not self.value(node, "position_ns"):
+            return False
+        known = [status for status in statuses if status is not None]
+        works = all(status.state in (NodeState.READY, NodeState.FINISHED) and not status.values["unmatched"] for status in known)
+        return works and len({status.values["session"] for status in known}) == 1
+
+
+@contextmanager
+def graph(
+    recording: Recording,
+    directory: Path,
+    rate: float = 1.0,
+    duration_s: float | None = None,
+    own: Mapping[str, Any] | None = None,
+) -> Iterator[Graph]:
+    """Run the graph over a bag.
+
+    Args:
+        recording: to play.
+        directory: for the parameter file.
+        rate: bag seconds a second.
+        duration_s: of the bag; all where not given.
+        own: further parameters of the driver.
+    """
+    parameter_file = directory / "vli.yaml"
+    parameter_file.write_text(to_yaml(Settings()))
+    playback = Playback(recording.bag, rate, 0.0, duration_s)
+    nodes = describe_graph(recording.calibration_path, playback=playback, audience=LISTENER)
+    recorder = Recorder(recording.calibration)
+    with (
+        NodeProcesses([_own(node, own or {}) for node in nodes], parameter_file) as processes,
+        GraphListener(recorder) as listener,
+    ):
+        yield Graph(processes, listener, recorder, Meter(listener))
+
+
+def _own(node: NodeDescription, driver: Mapping[str, Any]) -> NodeDescription:
+    """Return a node that is started again when it is killed, whichever it is; the driver with parameters of its own."""
+    further = driver if node.executable == SCANNER else {}
+    return replace(node, parameters={**node.parameters, **further}, respawn=True)
+
+
+def resident_mb(pid: int) -> float:
+    """Return the memory of a process that is its own, without what it shares (libraries, transport)."""
+    _, resident, shared, *_ = Path(f"/proc/{pid}/statm").read_text().split()
+    return (int(resident) - int(shared)) * _PAGE / 1e6
+
+
+@dataclass(frozen=True)
+class Offline:
+    """The same bag through the stages alone: processor time of each node's part, and the trajectory."""
+
+    recorder: Recorder
+    cpu_s: dict[str, float] = field(default_factory=dict)
+
+
+class _Timed:
+    """Stands for a stage object; adds the processor time of its methods to an account.
+
+    Args:
+        stage: the object.
+        account: node → seconds.
+        node: that runs this stage in the graph.
+    """
+
+    def __init__(self, stage: Any, account: dict[str, float], node: str) -> None:
+        self._stage, self._account, self._node = stage, account, node
+
+    def __getattr__(self, name: str) -> Any:
+        value = getattr(self._stage, name)
+        if not callable(value):
+            return value
+
+        def timed(*args: Any, **options: Any) -> Any:
+            begin_s = time.thread_time()
+            try:
+                return value(*args, **options)
+            finally:
+                self._account[self._node] = self._account.get(self._node, 0.0) + time.thread_time() - begin_s
+
+        return timed
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        if name.startswith("_"):
+            object.__setattr__(self, name, value)
+        else:
+            setattr(self._stage, name, value)
+
+
+def run_offline(recording: Recording, duration_s: float | None = None) -> Offline:
+    """Return what the stages take for a bag, without any transport; reading it counts as the driver's part."""
+    warm_up()
+    result = Offline(Recorder(recording.calibration))
+    stages = Stages.create(recording.calibration, Settings(), Mode.VLI_SLAM)
+    for name, node in (
+        ("demultiplexer", "demux_node"),
+        ("scanner", "demux_node"),
+        ("front_end", "frontend_node"),
+        ("back_end", "backend_node"),
+        ("mapper", MAPPING),
+    ):
+        setattr(stages, name, _Timed(getattr(stages, name), result.cpu_s, node))
+    pipeline = Pipeline(stages, Mode.VLI_SLAM)
+    items = iter(BagReader(recording.bag, BagTopics(), 0.0, duration_s))
+    while True:
+        begin_s = time.thread_time()
+        item = next(items, None)
+        result.cpu_s[SCANNER] = result.cpu_s.get(SCANNER, 0.0) + time.thread_time() - begin_s
+        if item is None:
+            break
+        if isinstance(item, EncodedImage):
+            # Done in another thread of the pipeline; here it is the processor time that counts.
+            begin_s = time.thread_time()
+            decode(item)
+            result.cpu_s["demux_node"] = result.cpu_s.get("demux_node", 0.0) + time.thread_time() - begin_s
+        result.recorder.add(pipeline.push(item))
+    result.recorder.add(pipeline.flush())
+    return result
+
+
+def rmse_mm(recorder: Recorder, truth: Trajectory) -> float:
+    """Return the translation RMSE of the live trajectory."""
+    live = Trajectory(
+        np.array(sorted(recorder.live), np.int64), np.stack([recorder.live[stamp] for stamp in sorted(recorder.live)])
+    )
+    return 1e3 * rms(np.linalg.norm(trajectory_errors(associate(live, truth), np.eye(4)).translation, axis=1))
