@@ -54,6 +54,9 @@ class FramePairing:
     def add_preintegration(self, preintegration: Preintegration | NoPreintegration) -> list[Item]:
         """Take the preintegration of one frame; return what can go now, in order."""
         self._inertial.append(preintegration)
+        if len(self._inertial) > _MAX_FRAMES:
+            self._inertial.popleft()
+            self.counters.add("preintegration_without_tracks")
         return self._release()
 
     def add_scan(self, scan: LaserScan) -> list[Item]:

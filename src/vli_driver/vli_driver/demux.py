@@ -21,6 +21,8 @@ from vli_driver.rhythm import Rhythm
 
 _LOCK_FRAMES = 4
 _LATE_LOCK_FRAMES = 60
+_MOST_WAITING = 600
+"""Frames that wait for a verdict, however close their stamps are."""
 _CLOCK_JUMP_NS = NANOSECONDS
 _HYSTERESIS = 0.15
 """Share of the contrast, around the middle of the two levels, in which brightness says nothing."""
@@ -161,7 +163,8 @@ class Demultiplexer:
         if self.is_alternating is False:
             return [self._accept(Exposure.LONG, frame)]
         self._waiting.append(frame)
-        if frame.image.stamp_ns - self._waiting[0].image.stamp_ns < self.config.start_s * NANOSECONDS:
+        waited_ns = frame.image.stamp_ns - self._waiting[0].image.stamp_ns
+        if waited_ns < self.config.start_s * NANOSECONDS and len(self._waiting) < _MOST_WAITING:
             return []
         self.is_alternating = False
         return self.flush()

@@ -7,16 +7,19 @@ zip's CRC-32 of every entry is checked when it is read. Entries are stored, not 
 from __future__ import annotations
 
 import json
+import math
 import os
+import tokenize
 import zipfile
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from vli_common.arrays import AnyArray
+from vli_common.arrays import AnyArray, FloatArray
 from vli_common.errors import InputError
 from vli_mapping.light import Light
 from vli_mapping.point_map import Columns
@@ -29,6 +32,11 @@ _HEADER = "header.json"
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 """Of every entry: the same map is the same file."""
 _VIEWS = "views"
+_MAX_HEADER_BYTES = 1 << 16
+_REACH_M = 1e4
+"""A map is of what the laser has reached; beyond, a place has no cell in the hash that points are found by."""
+_UNIT = 1.0 + 1e-3
+_DAMAGED = (KeyError, ValueError, TypeError, EOFError, RuntimeError, NotImplementedError, OverflowError, MemoryError)
 
 
 def save_map(path: Path, snapshot: Snapshot) -> None:
@@ -61,20 +69,11 @@ def load_map(path: Path) -> Snapshot:
     Raises:
         InputError: no such file, no map, of another version, or damaged.
     """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            header = _read_header(path, archive)
-            columns = {name: _read_array(archive, name) for name in (*_names(), _VIEWS)}
+    with _reading(path) as archive:
+        header = _read_header(path, archive)
+        columns = {name: _read_array(archive, name) for name in (*_names(), _VIEWS)}
         light = None if header["light"] is None else _light_from_json(header["light"])
-    except zipfile.BadZipFile as error:
-        raise InputError(
-            f"'{path}' is no map or a damaged one ({error}), expected what 'vli run' writes as 'map{SUFFIX}'"
-        ) from error
-    except OSError as error:
-        raise InputError(f"'{path}' cannot be read: {error.strerror or error}") from error
-    except (KeyError, ValueError, TypeError, EOFError, RuntimeError, NotImplementedError) as error:
-        raise InputError(f"map '{path}' is damaged ({error}); save it again") from error
-    return _checked(path, header, columns, light)
+        return _checked(path, header, columns, light)
 
 
 def map_origin(path: Path) -> str:
@@ -85,8 +84,8 @@ def map_origin(path: Path) -> str:
     """
     if not is_map(path):
         return ""
-    with zipfile.ZipFile(path) as archive:
-        return str(_read_header(path, archive).get("origin", ""))
+    with _reading(path) as archive:
+        return _origin(_read_header(path, archive))
 
 
 def is_map(path: Path) -> bool:
@@ -95,6 +94,22 @@ def is_map(path: Path) -> bool:
         return zipfile.is_zipfile(path)
     except OSError:
         return False
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[zipfile.ZipFile]:
+    """Give the open file; what goes wrong in the block is an error of the file."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            yield archive
+    except zipfile.BadZipFile as error:
+        raise InputError(
+            f"'{path}' is no map or a damaged one ({error}), expected what 'vli run' writes as 'map{SUFFIX}'"
+        ) from error
+    except OSError as error:
+        raise InputError(f"'{path}' cannot be read: {error.strerror or error}") from error
+    except (*_DAMAGED, tokenize.TokenError) as error:
+        raise InputError(f"map '{path}' is damaged ({error}); save it again") from error
 
 
 def _names() -> tuple[str, ...]:
@@ -109,28 +124,38 @@ def _arrays(snapshot: Snapshot) -> Iterator[tuple[str, AnyArray]]:
 def _read_header(path: Path, archive: zipfile.ZipFile) -> dict[str, Any]:
     if _HEADER not in archive.namelist():
         raise InputError(f"'{path}' is no map: it has no '{_HEADER}', expected what 'vli run' writes as 'map{SUFFIX}'")
-    header = json.loads(archive.read(_HEADER))
+    info = archive.getinfo(_HEADER)
+    if info.compress_type != zipfile.ZIP_STORED or info.file_size > _MAX_HEADER_BYTES:
+        raise ValueError(f"its header is compressed, or has '{info.file_size}' bytes")
+    header = json.loads(archive.read(info))
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise InputError(f"'{path}' is no map: its header does not say '{FORMAT}'")
     if header.get("version") != VERSION:
         raise InputError(
-            f"map '{path}' has version '{header.get('version')}', this program reads '{VERSION}'; scan again or update"
+            f"map '{path}' has version '{str(header.get('version'))[:20]}', this program reads '{VERSION}'; scan again or update"
         )
     return header
 
 
 def _read_array(archive: zipfile.ZipFile, name: str) -> AnyArray:
-    with archive.open(f"{name}.npy") as entry:
-        array: AnyArray = np.lib.format.read_array(entry, allow_pickle=False)
-        if entry.read(1):
-            raise ValueError(f"'{name}' is longer than it says")
-    return array
+    """Return a column; what it says of itself is believed only as far as the file has the bytes for it."""
+    info = archive.getinfo(f"{name}.npy")
+    if info.compress_type != zipfile.ZIP_STORED:
+        raise ValueError(f"'{name}' is compressed")
+    with archive.open(info) as entry:
+        if np.lib.format.read_magic(entry) != (1, 0):
+            raise ValueError(f"'{name}' is of another version")
+        shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(entry)
+        data = entry.read()
+    if dtype.hasobject or is_fortran or math.prod(shape) * dtype.itemsize != len(data):
+        raise ValueError(f"'{name}' is '{dtype}{list(shape)}', which is not what its '{len(data)}' bytes are")
+    return np.frombuffer(bytearray(data), dtype).reshape(shape)
 
 
 def _checked(path: Path, header: dict[str, Any], arrays: dict[str, AnyArray], light: Light | None) -> Snapshot:
     """Return the snapshot, if every array is what the map would have written."""
     views = arrays.pop(_VIEWS)
-    count = len(arrays["weight"])
+    count = len(arrays["weight"]) if arrays["weight"].ndim else -1
     wanted = Columns.empty(0)
     for name, array in arrays.items():
         model: AnyArray = getattr(wanted, name)
@@ -140,9 +165,19 @@ def _checked(path: Path, header: dict[str, Any], arrays: dict[str, AnyArray], li
     whole = views.dtype == np.float64 and views.shape[1:] == (3, 4) and count == header.get("points")
     if not whole or (count and not 0 <= columns.seen_by.min() <= columns.seen_by.max() < len(views)):
         raise InputError(f"map '{path}' is damaged: its points and views do not belong together; save it again")
-    if not (np.isfinite(columns.position).all() and (columns.weight > 0).all()):
-        raise InputError(f"map '{path}' is damaged: it has points that are nowhere; save it again")
-    return Snapshot(columns, views, light, str(header.get("origin", "")))
+    if not _is_sound(columns, views):
+        raise InputError(f"map '{path}' is damaged: it has points that are nowhere, or look like nothing; save it again")
+    return Snapshot(columns, views, light, _origin(header))
+
+
+def _is_sound(columns: Columns, views: FloatArray) -> bool:
+    """Return False where a number is none that mapping can have come to."""
+    sized = (np.abs(columns.position) < _REACH_M).all() and (np.abs(views) < _REACH_M).all()
+    shaped = (np.abs(columns.normal) <= _UNIT).all() and not np.isinf(columns.planarity).any()
+    # Colours may be NaN: of points that no long image saw.
+    coloured = not np.isinf(columns.colour).any()
+    weighed = (columns.weight > 0).all() and np.isfinite(columns.weight).all() and np.isfinite(columns.sigma).all()
+    return bool(sized and shaped and coloured and weighed and columns.solid.view(np.uint8).max(initial=0) <= 1)
 
 
 def _light_to_json(light: Light) -> dict[str, Any]:
@@ -157,6 +192,11 @@ def _light_to_json(light: Light) -> dict[str, Any]:
 def _light_from_json(values: dict[str, Any]) -> Light:
     first, second = map(float, values["vignetting"])
     position = np.array(values["position"], np.float64)
-    if position.shape != (3,):
-        raise ValueError("the light has no place")
-    return Light(position, float(values["ambient"]), (first, second), float(values["reference_m"]))
+    ambient, reference_m = float(values["ambient"]), float(values["reference_m"])
+    if position.shape != (3,) or not np.isfinite([*position, ambient, first, second, reference_m]).all():
+        raise ValueError("the light has no place, or no strength")
+    return Light(position, ambient, (first, second), reference_m)
+
+
+def _origin(header: dict[str, Any]) -> str:
+    return str(header.get("origin", ""))

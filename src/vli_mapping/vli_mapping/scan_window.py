@@ -21,6 +21,8 @@ from vli_mapping.normals import stripe_normals
 Stamped = TypeVar("Stamped", Image, LaserScan)
 _SPOTS_PER_SCAN = 6
 """Of the light: neighbours along a stripe say the same."""
+_MOST_WAITING = 1000
+"""Images, or scans, of whatever stamps: a sender that counts nanoseconds must not fill the memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,7 +253,7 @@ class ScanWindow:
 
     def _forget(self, items: dict[int, Stamped], now_ns: int, counter: str) -> None:
         oldest = now_ns - int(self._config.image_buffer_s * NANOSECONDS)
-        old = [stamp for stamp in items if stamp < oldest]
+        old = [stamp for stamp in items if stamp < oldest] or sorted(items)[: max(0, len(items) - _MOST_WAITING)]
         for stamp in old:
             del items[stamp]
         self._counters.add(counter, len(old))

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import json
 import zipfile
 from collections.abc import Callable
@@ -113,6 +114,40 @@ def header(**changes: object) -> Callable[[str, bytes], bytes]:
     return lambda name, data: json.dumps(json.loads(data) | changes).encode() if name == "header.json" else data
 
 
+def column(name: str, change: Callable[[Any], Any]) -> Callable[[str, bytes], bytes]:
+    """Return a rewriting that changes the values of one column, whose type and shape stay."""
+
+    def rewritten(entry: str, data: bytes) -> bytes:
+        if entry != f"{name}.npy":
+            return data
+        values = np.load(io.BytesIO(data))
+        stream = io.BytesIO()
+        np.save(stream, np.ascontiguousarray(change(values)).view(values.dtype))
+        return stream.getvalue()
+
+    return rewritten
+
+
+def claim(name: str, length: object) -> Callable[[str, bytes], bytes]:
+    """Return a rewriting after which one column says that it has this many rows."""
+
+    def rewritten(entry: str, data: bytes) -> bytes:
+        if entry != f"{name}.npy":
+            return data
+        head = f"{{'descr': '<f4', 'fortran_order': False, 'shape': ({length},), }}".encode().ljust(117) + b"\n"
+        return b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head + b"xxxx"
+
+    return rewritten
+
+
+def compress(path: Path) -> None:
+    with zipfile.ZipFile(path) as archive:
+        entries = {name: archive.read(name) for name in archive.namelist()}
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, data in entries.items():
+            archive.writestr(name, data, zipfile.ZIP_STORED if name == "header.json" else zipfile.ZIP_DEFLATED)
+
+
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
@@ -128,6 +163,15 @@ def header(**changes: object) -> Callable[[str, bytes], bytes]:
         (lambda path: rewrite(path, lambda name, data: None if name == "colour.npy" else data), "damaged.*colour"),
         (lambda path: rewrite(path, lambda name, data: b"junk" if name == "colour.npy" else data), "damaged"),
         (lambda path: rewrite(path, lambda name, data: data[:-40] if name == "sigma.npy" else data), "damaged"),
+        (lambda path: rewrite(path, column("position", lambda values: values * 1e300)), "points that are nowhere"),
+        (lambda path: rewrite(path, column("sigma", lambda values: values * np.float32("nan"))), "points that are nowhere"),
+        (lambda path: rewrite(path, column("solid", lambda values: values.view(np.uint8) * 0 + np.uint8(170))), "nowhere"),
+        (lambda path: rewrite(path, claim("weight", 10**12)), r"'weight' is 'float32\[1000000000000\]', which is not what its"),
+        (lambda path: rewrite(path, claim("weight", "(")), "damaged"),
+        (lambda path: rewrite(path, header(light=None, points=2)), "do not belong together"),
+        (lambda path: rewrite(path, header(origin="x" * 70_000)), "header is compressed, or has"),
+        (lambda path: rewrite(path, lambda name, data: b"[" * 60_000 if name == "header.json" else data), "damaged"),
+        (compress, "is compressed"),
     ],
 )
 def test_a_file_that_is_no_map_is_one_clear_line(
