@@ -52,6 +52,27 @@ class MapConfig:
         maximum=1.0e-2,
         doc="doubtful points stay only where no solid one is this near; larger: fewer outliers, gaps",
     )
+    ray_radius: float = parameter(
+        2.0e-4,
+        unit="m",
+        minimum=0.0,
+        maximum=1.0e-3,
+        doc="a view that passes a point this near speaks against it; larger: fewer ghosts, thinner edges; 0: off",
+    )
+    ray_margin: float = parameter(
+        5.0e-4,
+        unit="m",
+        minimum=1.0e-5,
+        maximum=1.0e-2,
+        doc="unless the point is this near in range to what is seen; smaller: fewer flying points, less surface",
+    )
+    hiding_weight: float = parameter(
+        3.0,
+        unit="points",
+        minimum=0.0,
+        maximum=1.0e6,
+        doc="weight of the map in the way of a view from which on its end is doubted; smaller: fewer ghosts below",
+    )
     min_planarity: float = parameter(
         0.75, minimum=0.0, maximum=1.0, doc="flatness below which a point has no normal rather than a wrong one"
     )

@@ -11,6 +11,7 @@ from vli_common.calibration import Calibration
 from vli_common.types import Counters, Image, LaserScan, MappingOutput, Mode, PointCloud, WindowPoses
 from vli_mapping.association import associate
 from vli_mapping.config import AS_SEEN, MappingConfig
+from vli_mapping.contradiction import contradict
 from vli_mapping.light import Light, LightEstimator
 from vli_mapping.point_map import PointMap, Stripe, to_bytes
 from vli_mapping.scan_window import PosedScan, ScanWindow
@@ -172,10 +173,12 @@ class Mapper:
 
     def _enter(self, item: PosedScan) -> IntArray:
         """Merge one scan into the map; return the map points (K,) it touched."""
-        target = self.map.insert(_stripe(item))
+        stripe, left = contradict(self.map, _stripe(item))
+        target = self.map.insert(stripe)
         touched = np.unique(target[target >= 0])
         self.counters.add("scans_entered")
         self.counters.add("points_entered", int((target >= 0).sum()))
+        self.counters.add("points_contradicted", left)
         self.counters.add("points_blurred", int((~item.usable).sum()))
         self.counters.add("points_doubtful_dropped", int((target < 0).sum()))
         self._refine(touched, item.viewpoint)

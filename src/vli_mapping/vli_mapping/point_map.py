@@ -9,7 +9,7 @@ import numpy as np
 from vli_common.arrays import AnyArray, BoolArray, ByteArray, Float32Array, FloatArray, Int32Array, IntArray
 from vli_common.types import PointCloud
 from vli_mapping.config import MapConfig
-from vli_mapping.insertion import FREE, ROWS, insert_stripe
+from vli_mapping.insertion import FREE, ROWS, insert_stripe, remove
 from vli_mapping.light import Light
 from vli_mapping.normals import refine_normals, smooth_normals
 from vli_mapping.spatial_hash import NONE, SpatialHash, link
@@ -176,6 +176,21 @@ class PointMap:
         weight = self.columns.weight
         np.add.at(weight, target[there], more[there])
         np.minimum(weight, np.float32(self.config.max_weight), out=weight, where=weight > 0)
+
+    def halve(self, which: IntArray) -> int:
+        """Halve the weight of rows ``which`` (K,), each once; doubtful ones, and those with one or less, leave; say how many."""
+        c = self.columns
+        which = self.alive(which)
+        c.weight[which] *= np.float32(0.5)
+        c.sigma[which] *= np.float32(np.sqrt(2.0))
+        gone = which[(c.weight[which] <= 1.0) | ~c.solid[which]]
+        self.remove(gone)
+        return len(gone)
+
+    def remove(self, which: IntArray) -> None:
+        """Let the points of rows ``which`` (K,), all of which hold one, leave."""
+        c = self.columns
+        remove(self.grid.heads, self.grid.next, CELL_M, self._state, c.position, c.weight, which)
 
     def refine_normals(self, which: IntArray, viewpoint: FloatArray) -> None:
         """Fit the normals of rows ``which`` (K,) again, to all that is near by now; new ones face ``viewpoint`` (3,)."""

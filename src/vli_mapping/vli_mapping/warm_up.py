@@ -9,6 +9,7 @@ from vli_common.types import Counters, LaserScan
 from vli_mapping.association import associate
 from vli_mapping.colour import colour_points
 from vli_mapping.config import AssociationConfig, EntryConfig, MapConfig
+from vli_mapping.contradiction import contradict
 from vli_mapping.entry import away_from_edges, facing, noisy, supported
 from vli_mapping.normals import smooth_normals, stripe_normals
 from vli_mapping.point_map import PointMap, Stripe
@@ -28,6 +29,7 @@ def warm_up() -> None:
         solid = away_from_edges(row, sigma, entry) & supported(row, row, entry.support_radius) & facing(row, normals, 80.0)
         solid[::3] = ~noisy(row, sigma, entry.max_blur)[::3] & (number % 2 == 0)
         stripe = Stripe(0, number, np.eye(4), row, normals, planarity, np.zeros((64, 3), np.float32), sigma, solid)
+        stripe, _ = contradict(point_map, stripe)
         point_map.refine_normals(np.unique(point_map.insert(stripe).clip(0)), np.zeros(3))
     c = point_map.columns
     smooth_normals(point_map.grid, c.position, c.normal, point_map.alive(), limits.normal_radius)
