@@ -8,9 +8,16 @@ from vli_simulation.config import SimulationError
 from vli_simulation.scenes.keyboard import make_keyboard
 from vli_simulation.scenes.part import make_part
 from vli_simulation.scenes.pipe import make_pipe
+from vli_simulation.scenes.plain import make_bar, make_plate
 from vli_simulation.scenes.scene import Scene
 
-SCENES: dict[str, Callable[[int], Scene]] = {"keyboard": make_keyboard, "pipe": make_pipe, "part": make_part}
+SCENES: dict[str, Callable[[int], Scene]] = {
+    "keyboard": make_keyboard,
+    "pipe": make_pipe,
+    "part": make_part,
+    "plate": make_plate,
+    "bar": make_bar,
+}
 """Scene name → function that makes it from a seed."""
 
 
