@@ -7,6 +7,7 @@ from vli_common.errors import InputError
 from vli_common.types import Counters, Image, LaserScan
 from vli_driver.config import StripeConfig
 from vli_driver.stripe import CentreOfMassDetector, StripeDetector
+from vli_driver.stripe_hint import StripeHint
 from vli_driver.triangulation import Triangulator, search_band, stripe_runs_across_columns
 
 
@@ -33,6 +34,7 @@ class StripeScanner:
         self._detector: StripeDetector = detector or CentreOfMassDetector(config, band)
         self._triangulator = Triangulator(calibration, along_columns, config.range_margin)
         self._min_points = config.min_points
+        self._hint = StripeHint(calibration, config, along_columns)
 
     def scan(self, short: Image) -> LaserScan:
         """Return the stripe of a short frame in the camera frame; empty where none is seen.
@@ -41,6 +43,16 @@ class StripeScanner:
             InputError: the image is not of the calibrated size.
         """
         self._check_size(short)
+        scan = self._scan(short)
+        self._hint.add(short.pixels, scan)
+        return scan
+
+    @property
+    def hint(self) -> str:
+        """What is wrong with the stripe, and what to do, in words; empty where nothing is."""
+        return self._hint.text
+
+    def _scan(self, short: Image) -> LaserScan:
         stripe = self._detector.detect(short.pixels)
         points, sigma, valid = self._triangulator.triangulate(stripe.pixels, stripe.sigma_px)
         self.counters.add("out_of_range", int(len(valid) - valid.sum()))

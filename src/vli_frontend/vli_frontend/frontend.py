@@ -22,6 +22,7 @@ from vli_common.types import (
 )
 from vli_frontend.config import FrontEndConfig
 from vli_frontend.keyframes import FrameVerdict, KeyframeRule
+from vli_frontend.motion_hint import MotionHint
 from vli_frontend.photometry import make_frame
 from vli_frontend.preintegration import Preintegrator
 from vli_frontend.stripe_distance import StripeDistance
@@ -54,6 +55,7 @@ class FrontEnd:
         self._keyframes = KeyframeRule(config.keyframe, calibration.camera.focal_px, mode.uses_laser)
         # Long and short frames alternate: 1.5 frame periods reach the neighbour, and no farther one where the rhythm jitters.
         self._stripes = StripeDistance(round(1.5 * NANOSECONDS / calibration.rate_hz))
+        self._motion = MotionHint()
         self._session = 0
         self._previous_ns: int | None = None
         self._gyro_bias = np.zeros(3)
@@ -69,6 +71,7 @@ class FrontEnd:
         self._keyframes.reset()
         self._stripes.clear()
         self._time_shift.reset()
+        self._motion.reset()
         self._previous_ns, self._gyro_bias, self._rotation_since_keyframe = None, np.zeros(3), None
 
     def set_bias(self, bias: ImuBias) -> None:
@@ -98,7 +101,11 @@ class FrontEnd:
 
     @property
     def hint(self) -> str:
-        """What to change in the calibration, in words; empty where nothing is wrong."""
+        """What to do, or to change in the calibration, in words; empty where nothing is wrong."""
+        return self._motion.text or self._time_shift_hint
+
+    @property
+    def _time_shift_hint(self) -> str:
         wrong_ns = self.timeshift_ns - self._calibration.timeshift_ns
         if wrong_ns == 0:
             return ""
@@ -143,7 +150,10 @@ class FrontEnd:
         segment = self._segment(stamp_ns) if ready.covered else None
         rotation = self._rotation(segment)
         frame = make_frame(ready.image, self._config.klt.normalisation_px)
+        before = len(self._tracker.tracks)
         self._tracker.follow(frame, (stamp_ns - (self._previous_ns or 0)) / NANOSECONDS, rotation)
+        if self._previous_ns is not None:
+            self._motion.add(before, len(self._tracker.tracks), self._motion_px(stamp_ns - self._previous_ns, rotation))
         verdict = self._judge(stamp_ns, rotation, segment)
         preintegration = None
         if self._preintegrator is not None and ready.covered:
@@ -153,6 +163,13 @@ class FrontEnd:
             self._begin_interval(stamp_ns, verdict.stationary)
         self._previous_ns = stamp_ns
         return FrontEndOutput(self._tracks(stamp_ns, verdict), preintegration)
+
+    def _motion_px(self, step_ns: int, rotation: FloatArray | None) -> float:
+        """Return how far the image has moved since the frame before: by its tracks, or the gyroscope where none is left."""
+        focal_px, tracks = self._calibration.camera.focal_px, self._tracker.tracks
+        if len(tracks):
+            return float(np.median(np.linalg.norm(tracks.velocity, axis=1))) * focal_px * step_ns / NANOSECONDS
+        return 0.0 if rotation is None else float(np.linalg.norm(rotation[:2, 2])) * focal_px
 
     def _segment(self, stamp_ns: int) -> ImuSegment | None:
         """Return the IMU since the frame before; for the first frame, that of one frame period."""

@@ -19,6 +19,7 @@ from vli_common.messages import (
     scan_to_message,
 )
 from vli_common.node import VliNode, run_node
+from vli_common.status import Health
 from vli_common.topics import EXPOSURE, IMAGE_LONG, IMAGE_RAW, IMAGE_RAW_COMPRESSED, IMAGE_SHORT, LASER_POINTS
 from vli_common.types import Counters, EncodedImage, Exposure, Image
 from vli_driver.bag import ExposureJoiner
@@ -89,6 +90,11 @@ class DemuxNode(VliNode):
         """Return the counters of demultiplexer and scanner."""
         scanner = self._scanner.counters.values if self._scanner else {}
         return Counters({**self._demultiplexer.counters.values, **scanner})
+
+    def stage_status(self) -> tuple[Health, str, dict[str, str]]:
+        """Return what is wrong with the stripe."""
+        hint = self._scanner.hint if self._scanner else ""
+        return Health.WARN if hint else Health.OK, hint, {}
 
     def _on_item(self, item: EncodedImage | ExposureNote) -> None:
         """Join images with the notes of the exposure topic, from the first note on."""
