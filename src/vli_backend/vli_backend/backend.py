@@ -23,7 +23,6 @@ from vli_backend.laser_check import LaserCheck
 from vli_backend.placement import Placement
 from vli_backend.smoother import SmootherError, StatePrior
 from vli_backend.starter import Starter
-from vli_common.arrays import FloatArray
 from vli_common.calibration import Calibration
 from vli_common.types import (
     NANOSECONDS,
@@ -33,14 +32,17 @@ from vli_common.types import (
     LaserScan,
     MapConstraints,
     Mode,
+    Relocalisation,
     TrackingState,
     WindowPoses,
 )
 
 _CONSTRAINTS_AGE = 2
 """Map constraints that answer an older keyframe than this many ago are dropped."""
-_MISSING_NS = 2 * NANOSECONDS
+_NO_LASER_NS, _NO_IMU_NS = 2 * NANOSECONDS, NANOSECONDS // 2
 """A sensor that says nothing for so long is missed."""
+_NO_IMAGE_NS = NANOSECONDS // 4
+"""A pose that rests on a longer gap between images is DEGRADED."""
 _RECOVERY_NS = NANOSECONDS
 """A solver that fails twice within this has lost the window."""
 _RESTART_VELOCITY = 0.02
@@ -77,8 +79,8 @@ class BackEnd:
         self._laser_check = LaserCheck(calibration, config, mode)
         self._inertial_scale = InertialScale.of_scene(calibration, config)
         self._reckoning, self._placement = DeadReckoning(), Placement()
-        self._last_scan_ns, self._last_imu_ns, self._last_good_ns = 0, 0, 0
-        self._last_failure_ns, self._constraints_after_ns = -_RECOVERY_NS, -1
+        self._last_scan_ns, self._last_imu_ns, self._last_good_ns, self._last_frame_ns = 0, 0, 0, 0
+        self._last_failure_ns, self._placed_ns = -_RECOVERY_NS, -1
 
     def reset(self, session: int, reason: str) -> None:
         """Forget everything of the old session and wait for a new start."""
@@ -86,22 +88,23 @@ class BackEnd:
         self.state, self.reason = TrackingState.INITIALISING, reason
         self._begin_map()
 
-    def relocalise(self, T_map_session: FloatArray, sigma_m: float, session: int) -> None:
+    def relocalise(self, found: Relocalisation) -> None:
         """Take where this session is in the map: from now on everything is published there.
 
-        Args:
-            T_map_session: (4, 4) from what was published as ``map`` so far to the map.
-            sigma_m: standard deviation of the position.
-            session: dropped and counted if it is not the present one.
+        One of another session, or of a window that has moved or is no more, is dropped and counted.
         """
-        if session != self.session:
+        if found.session != self.session:
             self.counters.add("relocalisations_of_other_sessions")
             return
-        self._placement.relocalise(T_map_session, sigma_m)
+        known = self._estimator.recent_keyframes(self._config.window_keyframes) if self._estimator is not None else []
+        if found.stamp_ns not in known or found.stamp_ns <= self._placed_ns:
+            self.counters.add("relocalisations_late")
+            return
+        self._placement.relocalise(found.T_map_session, found.sigma_m)
+        self._placed_ns = known[-1]
         if self._estimator is not None:
             # They were found where the window is no more.
             self._estimator.constraints = None
-            self._constraints_after_ns = self._estimator.recent_keyframes(1)[0]
         self.counters.add("relocalisations")
 
     @property
@@ -123,7 +126,7 @@ class BackEnd:
             self.counters.add("map_constraints_of_other_sessions")
         elif constraints.stamp_ns not in self._estimator.recent_keyframes(_CONSTRAINTS_AGE):
             self.counters.add("map_constraints_late")
-        elif constraints.stamp_ns <= self._constraints_after_ns:
+        elif constraints.stamp_ns <= self._placed_ns:
             self.counters.add("map_constraints_before_relocalisation")
         else:
             self._estimator.constraints = self._placement.to_window(constraints)
@@ -163,20 +166,23 @@ class BackEnd:
         self.state, self.reason = TrackingState.TRACKING, self._starter.reason
         if not self._placement.is_located:
             self.reason += f", {self._reckoning.elapsed_s(stamp):.1f} s after the loss"
-        self._last_good_ns = stamp
+        self._last_good_ns = self._last_frame_ns = stamp
         return self._output(stamp, estimator.current(stamp, self.session))
 
     def _track(self, frame: FrontEndOutput, estimator: WindowEstimator) -> BackEndOutput:
         stamp = frame.tracks.stamp_ns
+        unseen_ns, self._last_frame_ns = stamp - self._last_frame_ns, stamp
         result = estimator.add_frame(frame, self.session)
         self.counters.add("keyframes", int(frame.tracks.keyframe))
+        carrier = "the IMU carries it" if frame.preintegration is not None else "nothing carries it"
         if result.landmarks >= self._config.min_landmarks:
             self._last_good_ns = stamp
             self._check_scale(frame, result, estimator)
             self.state, self.reason = TrackingState.TRACKING, self._hint(stamp)
+            if unseen_ns > _NO_IMAGE_NS:
+                self.state, self.reason = TrackingState.DEGRADED, f"no image for {unseen_ns / NANOSECONDS:.1f} s: {carrier}"
             return self._output(stamp, result)
         blind_s = (stamp - self._last_good_ns) / NANOSECONDS
-        carrier = "the IMU carries it" if frame.preintegration is not None else "nothing carries it"
         self.state = TrackingState.DEGRADED
         self.reason = (
             f"{result.landmarks} features match the window, {self._config.min_landmarks} are needed: "
@@ -196,11 +202,13 @@ class BackEnd:
     def _hint(self, stamp_ns: int) -> str:
         """Return what is missing although it tracks, in words; empty where nothing is."""
         silent = (
-            ("no laser for {:.1f} s: the landmarks hold the scale", self._mode.uses_laser, self._last_scan_ns),
-            ("no IMU for {:.1f} s: vision carries on without it", self._mode.uses_imu, self._last_imu_ns),
+            ("no laser for {:.1f} s: the landmarks hold the scale", self._mode.uses_laser, self._last_scan_ns, _NO_LASER_NS),
+            ("no IMU for {:.1f} s: vision carries on without it", self._mode.uses_imu, self._last_imu_ns, _NO_IMU_NS),
         )
         missing = [
-            text.format((stamp_ns - last) / NANOSECONDS) for text, used, last in silent if used and stamp_ns - last > _MISSING_NS
+            text.format((stamp_ns - last) / NANOSECONDS)
+            for text, used, last, longest in silent
+            if used and stamp_ns - last > longest
         ]
         return "; ".join([*missing, *filter(None, [self._placement.hint, self._laser_check.hint])])
 
@@ -257,6 +265,6 @@ class BackEnd:
     def _wait_for_start(self) -> None:
         self._estimator = None
         self._starter = self._new_starter(self._calibration, self._config, self._mode)
-        self._last_good_ns, self._constraints_after_ns = 0, -1
+        self._last_good_ns, self._placed_ns = 0, -1
         self._laser_check.begin_window()
         self._inertial_scale.clear()

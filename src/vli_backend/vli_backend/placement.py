@@ -22,6 +22,8 @@ class Placement:
         self._sigma_m = 0.0
         self.is_located = True
         """False where the place in the map is a guess."""
+        self.number = 0
+        """Counts the places that the window had: what is published changes with it by a motion that nobody knows beforehand."""
 
     @property
     def hint(self) -> str:
@@ -34,13 +36,16 @@ class Placement:
 
     def guess(self, sigma_m: float) -> None:
         """Take how uncertain the place of a new window is, metres; zero where the map begins."""
-        self.is_located = self.is_located and sigma_m == 0.0
+        if sigma_m > 0.0:
+            self.is_located = False
+            self.number += 1
         self._sigma_m = float(np.hypot(self._sigma_m, sigma_m))
 
     def relocalise(self, T_map_session: FloatArray, sigma_m: float) -> None:
         """Take where what was published as ``map`` so far is in the map (4, 4), and how surely, metres."""
         self._T_map_world = T_map_session @ self._T_map_world
         self._sigma_m, self.is_located = sigma_m, True
+        self.number += 1
 
     def of_pose(self, pose: PoseEstimate) -> PoseEstimate:
         """Return a live pose in the map; the uncertainty of the place comes on top of its own."""
@@ -58,8 +63,11 @@ class Placement:
         )
 
     def of_window(self, window: WindowPoses) -> WindowPoses:
-        """Return the poses of a window in the map."""
-        return window if self._is_identity else replace(window, T_map_camera=self._T_map_world @ window.T_map_camera)
+        """Return the poses of a window in the map, and whether that is known."""
+        if self.number == 0:
+            return window
+        T_map_camera = self._T_map_world @ window.T_map_camera
+        return replace(window, T_map_camera=T_map_camera, located=self.is_located, placement=self.number)
 
     def to_window(self, constraints: MapConstraints) -> MapConstraints:
         """Return map constraints, eq. (4), in the window's world."""

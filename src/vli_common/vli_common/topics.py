@@ -31,7 +31,14 @@ TRACKS_FIELDS = np.dtype(
     [("id", "<u4"), *_doubles("u", "v", "x", "y", "vx", "vy", "sigma", "stripe_px"), ("flags", "u1"), *_SESSION]
 )
 WINDOW_FIELDS = np.dtype(
-    [*_STAMP, ("kind", "u1"), ("state", "u1"), *_doubles("px", "py", "pz", "qx", "qy", "qz", "qw"), *_SESSION]
+    [
+        *_STAMP,
+        ("kind", "u1"),
+        ("state", "u1"),
+        *_doubles("px", "py", "pz", "qx", "qy", "qz", "qw"),
+        ("placement", "<u4"),
+        *_SESSION,
+    ]
 )
 MAP_CONSTRAINTS_FIELDS = np.dtype(
     [*_STAMP, *_doubles("px", "py", "pz", "gx", "gy", "gz", "nx", "ny", "nz", "sigma", "weight"), *_SESSION]
@@ -57,6 +64,8 @@ class WindowState(IntFlag):
     """Has left the window: sent for the last time."""
     REDUNDANT = 2
     """Taken at rest, adds nothing to the map."""
+    UNLOCATED = 4
+    """Where it is in the map is a guess; of all rows or none."""
 
 
 @dataclass(frozen=True, slots=True)

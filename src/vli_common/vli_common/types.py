@@ -253,6 +253,8 @@ class WindowPoses:
         final: (N,) bool, True for a frame that has left the window: its pose will not change again, it is sent for the last time.
         redundant: (N,) bool, True for a scan taken at rest that adds nothing to the map.
         T_map_camera: (N, 4, 4).
+        located: False where ``map`` is a guess, from a loss to a relocalisation.
+        placement: counts the losses and relocalisations of the session; poses of two placements differ by an unknown motion.
     """
 
     stamp_ns: int
@@ -262,9 +264,27 @@ class WindowPoses:
     redundant: BoolArray
     T_map_camera: FloatArray
     session: int = 0
+    located: bool = True
+    placement: int = 0
 
     def __len__(self) -> int:
         return len(self.stamps)
+
+
+@dataclass(frozen=True, slots=True)
+class Relocalisation:
+    """Where a session is in the map.
+
+    Args:
+        stamp_ns: newest keyframe of the window that was found.
+        T_map_session: (4, 4) from what was published as ``map`` with that window to the map.
+        sigma_m: one standard deviation of the position, metres.
+    """
+
+    stamp_ns: int
+    T_map_session: FloatArray
+    sigma_m: float
+    session: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -338,6 +358,8 @@ class MappingOutput:
     """The newest coloured stripes, live."""
     update: PointCloud | None = None
     """Points that entered the map, final."""
+    relocalisation: Relocalisation | None = None
+    """Where the session is in the map, once it has been found again."""
 
 
 @dataclass(slots=True)

@@ -13,7 +13,7 @@ from vli_backend.backend import BackEnd
 from vli_backend.config import BackEndConfig
 from vli_backend.smoother import GtsamSmoother, SmootherError
 from vli_common.geometry import inverse, pose, so3_exp
-from vli_common.types import BackEndOutput, FrontEndOutput, LaserScan, MapConstraints, Mode, TrackingState
+from vli_common.types import BackEndOutput, FrontEndOutput, LaserScan, MapConstraints, Mode, Relocalisation, TrackingState
 
 Change = Callable[[FrontEndOutput, float], FrontEndOutput | None]
 
@@ -98,14 +98,14 @@ def test_after_a_long_outage_it_starts_again_where_the_imu_carried_it() -> None:
 def test_a_relocalisation_moves_everything_into_the_map_from_then_on() -> None:
     scan, T = Scan(), pose(so3_exp(np.array([0.0, 0.0, 0.7])), np.array([0.1, -0.2, 0.05]))
     back_end = BackEnd(calibration(), BackEndConfig(), Mode.VLI_SLAM)
-    reference = BackEnd(calibration(), BackEndConfig(), Mode.VLI_SLAM)
+    reference, window_ns = BackEnd(calibration(), BackEndConfig(), Mode.VLI_SLAM), 0
     for item in scan.frames(3.0):
         if isinstance(item, LaserScan):
             back_end.add_scan(item)
             reference.add_scan(item)
             continue
         if item.tracks.stamp_ns > 2_500_000_000 and back_end.counters["relocalisations"] == 0:
-            back_end.relocalise(T, 1e-3, session=0)
+            back_end.relocalise(Relocalisation(window_ns, T, 1e-3))
         moved, plain = back_end.add_frame(item), reference.add_frame(item)
         expected = T if back_end.counters["relocalisations"] else np.eye(4)
         if plain.pose is not None and moved.pose is not None:
@@ -117,9 +117,25 @@ def test_a_relocalisation_moves_everything_into_the_map_from_then_on() -> None:
             )
         if plain.window is not None and moved.window is not None:
             np.testing.assert_allclose(moved.window.T_map_camera, expected @ plain.window.T_map_camera, atol=1e-9)
+            assert moved.window.placement == back_end.counters["relocalisations"]
+            window_ns = moved.window.stamp_ns
     assert back_end.is_located
-    back_end.relocalise(T, 1e-3, session=5)
+    back_end.relocalise(Relocalisation(window_ns, T, 1e-3, session=5))
     assert back_end.counters["relocalisations_of_other_sessions"] == 1
+
+
+def test_a_relocalisation_of_a_window_that_has_moved_since_is_dropped() -> None:
+    back_end, stamps = BackEnd(calibration(), BackEndConfig(), Mode.VLI_SLAM), []
+    for item in Scan().frames(2.5):
+        if isinstance(item, LaserScan):
+            back_end.add_scan(item)
+        elif (window := back_end.add_frame(item).window) is not None:
+            stamps.append(window.stamp_ns)
+    back_end.relocalise(Relocalisation(stamps[-1], np.eye(4), 1e-3))
+    for stamp_ns in (stamps[-2], stamps[-1], stamps[-1] + 1):
+        back_end.relocalise(Relocalisation(stamp_ns, np.eye(4), 1e-3))
+    assert back_end.counters["relocalisations"] == 1
+    assert back_end.counters["relocalisations_late"] == 3
 
 
 def test_constraints_found_before_a_relocalisation_are_dropped() -> None:
@@ -131,7 +147,7 @@ def test_constraints_found_before_a_relocalisation_are_dropped() -> None:
             window_ns = window.stamp_ns
     none = np.empty(0)
     constraints = MapConstraints(window_ns, none.astype(np.int64), *(np.empty((0, 3)) for _ in range(3)), none, none)
-    back_end.relocalise(np.eye(4), 1e-3, session=0)
+    back_end.relocalise(Relocalisation(window_ns, np.eye(4), 1e-3))
     back_end.add_constraints(constraints)
     assert back_end.counters["map_constraints_before_relocalisation"] == 1
 

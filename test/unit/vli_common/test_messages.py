@@ -36,6 +36,7 @@ from vli_common.types import (
     PointCloud,
     PoseEstimate,
     Preintegration,
+    Relocalisation,
     TrackFlag,
     Tracks,
     WindowPoses,
@@ -82,7 +83,9 @@ def tracks_of(count: int) -> Tracks:
 def window_of(count: int) -> WindowPoses:
     T = geometry.pose(Rotation.random(count, random_state=2).as_matrix(), RANDOM.normal(size=(count, 3)))
     kinds, flags = RANDOM.integers(0, 3, count).astype(np.uint8), RANDOM.random((2, count)) < 0.5
-    return WindowPoses(STAMP_NS, STAMP_NS - 10_000_000 * np.arange(count)[::-1], kinds, flags[0], flags[1], T, 4)
+    located, placement = count % 2 == 0, 3 if count else 0
+    stamps = STAMP_NS - 10_000_000 * np.arange(count)[::-1]
+    return WindowPoses(STAMP_NS, stamps, kinds, flags[0], flags[1], T, 4, located, placement)
 
 
 def constraints_of(count: int) -> MapConstraints:
@@ -258,10 +261,15 @@ def test_paths_and_relocalisations_come_back() -> None:
     ((stamp_ns, T),) = messages.path_from_message(messages.path_to_message([messages.pose_to_message(pose)]))
     assert stamp_ns == STAMP_NS
     np.testing.assert_allclose(T, pose.T_map_imu, atol=1e-15)
-    message = messages.relocalisation_to_message(STAMP_NS, pose.T_map_odom, pose.covariance)
-    stamp_ns, T, covariance = messages.relocalisation_from_message(through_the_wire(message))
-    np.testing.assert_allclose(T, pose.T_map_odom, atol=1e-15)
-    np.testing.assert_array_equal(covariance, pose.covariance)
+    found = Relocalisation(STAMP_NS, pose.T_map_odom, 2e-4, 3)
+    message = through_the_wire(messages.relocalisation_to_message(found))
+    back = messages.relocalisation_from_message(message, 3)
+    assert (back.stamp_ns, back.session) == (found.stamp_ns, found.session)
+    assert back.sigma_m == pytest.approx(found.sigma_m)
+    np.testing.assert_allclose(back.T_map_session, found.T_map_session, atol=1e-15)
+    message.pose.covariance[0] = -1.0
+    with pytest.raises(MessageError, match="variances"):
+        messages.relocalisation_from_message(message)
 
 
 def test_sessions_and_statuses_come_back() -> None:

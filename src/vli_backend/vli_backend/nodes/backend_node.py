@@ -6,6 +6,8 @@ import sys
 from collections import deque
 from typing import Any
 
+from geometry_msgs.msg import PoseWithCovarianceStamped
+
 from vli_backend.backend import BackEnd
 from vli_backend.config import BackEndConfig
 from vli_backend.warm_up import warm_up
@@ -21,6 +23,7 @@ from vli_common.messages import (
     pose_to_message,
     pose_transforms,
     preintegration_from_message,
+    relocalisation_from_message,
     scan_from_message,
     tracks_from_message,
     transform_to_message,
@@ -38,6 +41,7 @@ from vli_common.topics import (
     PATH,
     POSE,
     PREINTEGRATION,
+    RELOCALISATION,
     TF,
     TF_STATIC,
     TRACKS,
@@ -51,6 +55,7 @@ from vli_common.types import (
     MapConstraints,
     PoseEstimate,
     Preintegration,
+    Relocalisation,
     TrackingState,
     Tracks,
     WindowPoses,
@@ -88,6 +93,7 @@ class BackEndNode(VliNode):
         self.receive(PREINTEGRATION, preintegration_from_message, self._on_preintegration)
         self.receive(TRACKS, tracks_from_message, self._on_tracks)
         self.receive(MAP_CONSTRAINTS, constraints_from_message, self._on_constraints, ends=False, required=self.mode.uses_map)
+        self.receive(RELOCALISATION, self._read_relocalisation, self._on_relocalisation, ends=False, required=False)
 
     def create_stage(self, calibration: Calibration | None) -> None:
         """Make the back end, and say where the camera is on the IMU."""
@@ -143,6 +149,12 @@ class BackEndNode(VliNode):
 
     def _on_constraints(self, constraints: MapConstraints) -> None:
         self.back_end.add_constraints(constraints)
+
+    def _read_relocalisation(self, message: PoseWithCovarianceStamped) -> Relocalisation:
+        return relocalisation_from_message(message, self.session)
+
+    def _on_relocalisation(self, found: Relocalisation) -> None:
+        self.back_end.relocalise(found)
 
     def _on_preintegration(self, preintegration: Preintegration | NoPreintegration) -> None:
         self._feed(self._pairing.add_preintegration(preintegration))

@@ -108,7 +108,9 @@ def window_to_message(window: WindowPoses) -> PointCloud2:
     rows = np.empty(len(window), WINDOW_FIELDS)
     _set_stamps(rows, window.stamps)
     rows["kind"] = window.kinds
-    rows["state"] = WindowState.FINAL * window.final | WindowState.REDUNDANT * window.redundant
+    place = WindowState.IN if window.located else WindowState.UNLOCATED
+    rows["state"] = WindowState.FINAL * window.final | WindowState.REDUNDANT * window.redundant | place
+    rows["placement"] = window.placement
     _set_columns(rows, ("px", "py", "pz"), window.T_map_camera[:, :3, 3])
     _set_columns(rows, ("qx", "qy", "qz", "qw"), geometry.quaternion_from_rotation(window.T_map_camera[:, :3, :3]))
     return cloud_from_rows(rows, header(window.stamp_ns, MAP_FRAME), window.session)
@@ -136,6 +138,8 @@ def window_from_message(message: PointCloud2) -> WindowPoses:
             rotations_from_quaternions(_columns(rows, ("qx", "qy", "qz", "qw"))), _columns(rows, ("px", "py", "pz"))
         ),
         session=cloud_session(message, rows),
+        located=not (rows["state"] & WindowState.UNLOCATED).any(),
+        placement=int(rows["placement"][0]) if len(rows) else 0,
     )
 
 

@@ -19,8 +19,9 @@ from vli_common import geometry
 from vli_common.arrays import FloatArray
 from vli_common.errors import MessageError
 from vli_common.messages.basics import from_time, header
+from vli_common.messages.limits import LARGEST_VARIANCE, checked
 from vli_common.topics import IMU_FRAME, MAP_FRAME, ODOM_FRAME
-from vli_common.types import PoseEstimate
+from vli_common.types import PoseEstimate, Relocalisation
 
 _UNIT_TOLERANCE = 1e-3
 
@@ -112,20 +113,25 @@ def transform_from_message(message: TransformStamped) -> tuple[int, str, str, Fl
     return from_time(message.header.stamp), message.header.frame_id, message.child_frame_id, T
 
 
-def relocalisation_to_message(stamp_ns: int, T_map_session: FloatArray, covariance: FloatArray) -> PoseWithCovarianceStamped:
-    """Return ``relocalisation``: this session's ``map`` in the loaded one, with its covariance (6, 6)."""
-    message = PoseWithCovarianceStamped(header=header(stamp_ns, MAP_FRAME))
-    message.pose.pose, message.pose.covariance = _to_pose(T_map_session), covariance.ravel()
+def relocalisation_to_message(found: Relocalisation) -> PoseWithCovarianceStamped:
+    """Return ``relocalisation``: the session's ``map`` so far in the map; the covariance has the position alone."""
+    message = PoseWithCovarianceStamped(header=header(found.stamp_ns, MAP_FRAME))
+    message.pose.pose = _to_pose(found.T_map_session)
+    message.pose.covariance = np.diag([found.sigma_m**2] * 3 + [0.0] * 3).ravel()
     return message
 
 
-def relocalisation_from_message(message: PoseWithCovarianceStamped) -> tuple[int, FloatArray, FloatArray]:
-    """Return stamp, T_map_session (4, 4) and covariance (6, 6).
+def relocalisation_from_message(message: PoseWithCovarianceStamped, session: int = 0) -> Relocalisation:
+    """Return where a session is in the map; the message does not say which session, the stamp tells those of others.
 
     Raises:
-        MessageError: not finite, or no unit quaternion.
+        MessageError: not finite, or no unit quaternion, or a negative variance.
     """
-    return from_time(message.header.stamp), _from_pose(message.pose.pose), _covariance(message.pose.covariance)
+    variances = np.diag(_covariance(message.pose.covariance))[:3]
+    if (variances < 0).any():
+        raise MessageError(f"relocalisation has the variances '{variances.tolist()}', expected none below 0")
+    stamp_ns, T_map_session = from_time(message.header.stamp), _from_pose(message.pose.pose)
+    return Relocalisation(stamp_ns, T_map_session, float(np.sqrt(variances.max())), session)
 
 
 def from_vector(vector: Vector3) -> FloatArray:
@@ -134,7 +140,7 @@ def from_vector(vector: Vector3) -> FloatArray:
     Raises:
         MessageError: not finite.
     """
-    return _finite(np.array([vector.x, vector.y, vector.z]))
+    return checked(np.array([vector.x, vector.y, vector.z]), "vector")
 
 
 def to_vector(values: FloatArray) -> Vector3:
@@ -162,15 +168,9 @@ def _to_pose(T: FloatArray) -> Pose:
 
 def _from_pose(pose: Pose) -> FloatArray:
     p, q = pose.position, pose.orientation
-    rotation = rotations_from_quaternions(_finite(np.array([q.x, q.y, q.z, q.w])))
-    return geometry.pose(rotation, _finite(np.array([p.x, p.y, p.z])))
+    rotation = rotations_from_quaternions(checked(np.array([q.x, q.y, q.z, q.w]), "quaternion"))
+    return geometry.pose(rotation, checked(np.array([p.x, p.y, p.z]), "position"))
 
 
 def _covariance(values: FloatArray) -> FloatArray:
-    return _finite(np.array(values, dtype=np.float64)).reshape(6, 6)
-
-
-def _finite(values: FloatArray) -> FloatArray:
-    if not np.isfinite(values).all():
-        raise MessageError(f"message has '{values.tolist()}', expected finite values")
-    return values
+    return checked(np.array(values, dtype=np.float64), "covariance", LARGEST_VARIANCE).reshape(6, 6)
