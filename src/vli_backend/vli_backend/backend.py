@@ -41,8 +41,8 @@ _CONSTRAINTS_AGE = 2
 """Map constraints that answer an older keyframe than this many ago are dropped."""
 _NO_LASER_NS, _NO_IMU_NS = 2 * NANOSECONDS, NANOSECONDS // 2
 """A sensor that says nothing for so long is missed."""
-_NO_IMAGE_NS = NANOSECONDS // 4
-"""A pose that rests on a longer gap between images is DEGRADED."""
+_NO_IMAGE = (NANOSECONDS // 4, 8)
+"""ns and frame periods: a pose across a gap between images that is longer than both is DEGRADED."""
 _RECOVERY_NS = NANOSECONDS
 """A solver that fails twice within this has lost the window."""
 _RESTART_VELOCITY = 0.02
@@ -179,7 +179,7 @@ class BackEnd:
             self._last_good_ns = stamp
             self._check_scale(frame, result, estimator)
             self.state, self.reason = TrackingState.TRACKING, self._hint(stamp)
-            if unseen_ns > _NO_IMAGE_NS:
+            if unseen_ns > self._longest_unseen_ns:
                 self.state, self.reason = TrackingState.DEGRADED, f"no image for {unseen_ns / NANOSECONDS:.1f} s: {carrier}"
             return self._output(stamp, result)
         blind_s = (stamp - self._last_good_ns) / NANOSECONDS
