@@ -5,6 +5,7 @@ from __future__ import annotations
 import array
 import copy
 import dataclasses
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -415,6 +416,11 @@ def first_number(text: str, replacement: str) -> str:
     return text.replace(token, replacement, 1)
 
 
+def last_number(text: str, replacement: str, place: int = -1) -> str:
+    numbers = list(re.finditer(r"-?\d\.\d+e[+-]\d+", text))
+    return text[: numbers[place].start()] + replacement + text[numbers[place].end() :]
+
+
 @pytest.mark.parametrize(
     ("message", "complaint"),
     [
@@ -425,7 +431,22 @@ def first_number(text: str, replacement: str) -> str:
         (preintegration_message(lambda text: text.replace("35 gtsam", "2147483647 gtsam")), "another form"),
         (preintegration_message(lambda text: text.replace(" 3 3 ", " 999999 999999 ")), "another form"),
         (preintegration_message(lambda text: first_number(text, "nan")), "another form"),
-        (preintegration_message(lambda text: first_number(text, "1.0e+999")), "beyond the range"),
+        (preintegration_message(lambda text: first_number(text, "1.0e+999")), "has 'inf', expected finite values up to 1e+06"),
+        (
+            preintegration_message(lambda text: first_number(text, "-1.0e+00")),
+            "gyroscope covariance that is not positive definite",
+        ),
+        (preintegration_message(lambda text: first_number(text, "1.0e+300")), "has '1e+300', expected finite values"),
+        (preintegration_message(lambda text: text.replace("-9.81", "-1.81", 1)), "gravity of '1.81"),
+        (
+            preintegration_message(lambda text: text.replace(" 1.00000000000000006e-01", " 5.0e+02", 1)),
+            "has the bias '[500.0, 0.2",
+        ),
+        (preintegration_message(lambda text: last_number(text, "-1.0e-09")), "a covariance that is not positive definite"),
+        (
+            preintegration_message(lambda text: last_number(text, "1.0e+03", place=-3)),
+            "covariance of nothing, or one that is not",
+        ),
         (preintegration_message(inflate=0.5), "inflate '0.5'"),
         (preintegration_message(inflate=float("nan")), "field 'inflate' has 'nan'"),
         (preintegration_message(from_sec=5), "spans '0.3"),

@@ -2,7 +2,8 @@
 
 A preintegration crosses the topic as GTSAM's own text archive. An archive says how much to allocate and which classes to make, so
 before GTSAM sees it, its skeleton (every token that is no floating-point number) is compared with that of an archive made here,
-its numbers are checked to be finite, and its checksum and time span to be right. Never a pickle.
+its numbers are checked to be such as preintegrating leads to (covariances positive definite, gravity that of the Earth), and its
+checksum and time span to be right. Never a pickle.
 """
 
 from __future__ import annotations
@@ -17,15 +18,36 @@ import numpy as np
 from geometry_msgs.msg import TwistStamped
 from sensor_msgs.msg import Imu, PointCloud2
 
+from vli_common.arrays import FloatArray
 from vli_common.errors import MessageError
 from vli_common.frame_pairing import NoPreintegration
 from vli_common.messages.basics import from_time, header
+from vli_common.messages.limits import LARGEST, checked
 from vli_common.messages.pointcloud import cloud_from_rows, cloud_session, field_count, rows_from_cloud
 from vli_common.messages.poses import from_vector, to_vector
 from vli_common.topics import IMU_FRAME, preintegration_fields
 from vli_common.types import NANOSECONDS, ImuBias, ImuSample, Preintegration
 
 _MAX_ARCHIVE_BYTES = 65536
+_MAX_SPAN_S = 60.0
+_MAX_BIAS = 100.0
+_GRAVITY_RANGE = (9.7, 9.9)
+_SYMMETRY = 1e-6
+_PARTS = {
+    "gyroscope covariance": 9,
+    "accelerometer covariance": 9,
+    "integration covariance": 9,
+    "gravity": 3,
+    "walk of the accelerometer's bias": 9,
+    "walk of the gyroscope's bias": 9,
+    "bias": 6,
+    "span": 1,
+    "increments": 9,
+    "derivatives": 54,
+    "covariance": 225,
+}
+"""Numbers of an archive, in their order: parameters, then what was measured with them."""
+_COVARIANCES = [name for name in _PARTS if name.startswith("walk") or name.endswith("covariance")]
 _SPAN_TOLERANCE_S = 1e-6
 _NO_DATA = -1.0
 _NUMBER = re.compile(r"-?\d\.\d+e[+-]\d+")
@@ -80,7 +102,9 @@ def preintegration_to_message(preintegration: Preintegration) -> PointCloud2:
     data = text.encode("ascii")
     row = np.zeros(1, preintegration_fields(len(data)))
     row["from_sec"], row["from_nanosec"] = divmod(preintegration.from_ns, NANOSECONDS)
-    row["inflate"], row["crc32"], row["data"] = preintegration.inflate, zlib.crc32(data), np.frombuffer(data, np.uint8)
+    # Inflated a million times, it says nothing any more.
+    row["inflate"] = min(preintegration.inflate, LARGEST)
+    row["crc32"], row["data"] = zlib.crc32(data), np.frombuffer(data, np.uint8)
     return cloud_from_rows(row, header(preintegration.stamp_ns, IMU_FRAME), preintegration.session)
 
 
@@ -113,7 +137,7 @@ def preintegration_from_message(message: PointCloud2) -> Preintegration | NoPrei
     stamp_ns, from_ns = from_time(message.header.stamp), int(row["from_sec"]) * NANOSECONDS + int(row["from_nanosec"])
     measurements = _measurements(data)
     span_s, expected_s = measurements.deltaTij(), (stamp_ns - from_ns) / NANOSECONDS
-    if expected_s <= 0 or not math.isclose(span_s, expected_s, rel_tol=0.0, abs_tol=_SPAN_TOLERANCE_S):
+    if not 0 < expected_s <= _MAX_SPAN_S or not math.isclose(span_s, expected_s, rel_tol=0.0, abs_tol=_SPAN_TOLERANCE_S):
         raise MessageError(f"preintegration spans '{span_s}' s, its stamps '{expected_s}' s")
     return Preintegration(stamp_ns, from_ns, measurements, float(row["inflate"]), cloud_session(message, rows))
 
@@ -130,11 +154,36 @@ def _measurements(data: bytes) -> gtsam.PreintegratedCombinedMeasurements:
 
 
 def _check_archive(text: str) -> None:
+    """Raise where an archive is not of the form, or its numbers are not of the size, that preintegrating leads to."""
     tokens = text.split()
     if _skeleton(tokens) != _reference_skeleton():
         raise MessageError("preintegration has an archive of another form (other GTSAM version, or values that are not finite)")
-    if not all(math.isfinite(float(token)) for token in tokens if _NUMBER.fullmatch(token)):
-        raise MessageError("preintegration has values beyond the range of a double")
+    numbers = np.array([float(token) for token in tokens if _NUMBER.fullmatch(token)])
+    if len(numbers) != sum(_PARTS.values()):
+        raise MessageError(f"preintegration has '{len(numbers)}' numbers, expected {sum(_PARTS.values())}: another GTSAM version")
+    parts = dict(zip(_PARTS, np.split(numbers, np.cumsum(list(_PARTS.values()))[:-1]), strict=True))
+    checked(numbers, "preintegration")
+    for name in _COVARIANCES:
+        _check_covariance(name, parts[name])
+    gravity = float(np.linalg.norm(parts["gravity"]))
+    if not _GRAVITY_RANGE[0] <= gravity <= _GRAVITY_RANGE[1]:
+        raise MessageError(
+            f"preintegration has a gravity of '{gravity}' m/s², expected {_GRAVITY_RANGE[0]} to {_GRAVITY_RANGE[1]}"
+        )
+    if np.abs(parts["bias"]).max() > _MAX_BIAS:
+        raise MessageError(f"preintegration has the bias '{parts['bias'].tolist()}', expected at most {_MAX_BIAS}")
+
+
+def _check_covariance(name: str, values: FloatArray) -> None:
+    side = math.isqrt(len(values))
+    matrix = values.reshape(side, side)
+    scale = float(np.abs(matrix).max())
+    if scale == 0 or np.abs(matrix - matrix.T).max() > _SYMMETRY * scale:
+        raise MessageError(f"preintegration has the {name} of nothing, or one that is not symmetric")
+    try:
+        np.linalg.cholesky(matrix)
+    except np.linalg.LinAlgError:
+        raise MessageError(f"preintegration has a {name} that is not positive definite") from None
 
 
 def _skeleton(tokens: list[str]) -> tuple[str, ...]:

@@ -17,6 +17,7 @@ from std_msgs.msg import Header
 
 from vli_common.arrays import AnyArray, ByteArray, Float32Array
 from vli_common.errors import MessageError
+from vli_common.messages.limits import checked
 
 _DATATYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 _FORMATS = {code: f"<{name}" for name, code in _DATATYPES.items()}
@@ -60,7 +61,8 @@ def rows_from_cloud(message: PointCloud2, layout: np.dtype[np.void], infinite: C
         infinite: fields that may be infinite; NaN is refused everywhere.
 
     Raises:
-        MessageError: fields missing or of another type, sizes that do not fit the data, values that are not finite.
+        MessageError: fields missing or of another type, sizes that do not fit the data, values that are not finite, or too large
+            for anything measured.
     """
     dtype = _message_dtype(message, layout)
     data = np.frombuffer(message.data, np.uint8)
@@ -74,7 +76,7 @@ def rows_from_cloud(message: PointCloud2, layout: np.dtype[np.void], infinite: C
         return np.empty(0, layout)
     rows: AnyArray = np.ndarray((height, width), dtype, data, strides=(row_step, message.point_step)).reshape(-1)
     rows.flags.writeable = False
-    _check_finite(rows, layout, infinite)
+    _check_values(rows, layout, infinite)
     return rows
 
 
@@ -158,12 +160,10 @@ def _message_dtype(message: PointCloud2, layout: np.dtype[np.void]) -> np.dtype[
     return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": message.point_step})
 
 
-def _check_finite(rows: AnyArray, layout: np.dtype[np.void], infinite: Collection[str]) -> None:
+def _check_values(rows: AnyArray, layout: np.dtype[np.void], infinite: Collection[str]) -> None:
     for name in layout.names or ():
         # The bits of a packed colour are no number: black with full red is a NaN to nobody but numpy.
         if layout[name].kind != "f" or name == "rgb":
             continue
         column = rows[name]
-        if np.isnan(column).any() if name in infinite else not np.isfinite(column).all():
-            bad = column[np.isnan(column) | (np.isinf(column) if name not in infinite else False)][0]
-            raise MessageError(f"field '{name}' has '{bad}', expected finite values")
+        checked(column[~np.isinf(column)] if name in infinite else column, f"field '{name}'")
