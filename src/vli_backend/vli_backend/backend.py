@@ -81,6 +81,7 @@ class BackEnd:
         self._reckoning, self._placement = DeadReckoning(), Placement()
         self._last_scan_ns, self._last_imu_ns, self._last_good_ns, self._last_frame_ns = 0, 0, 0, 0
         self._last_failure_ns, self._placed_ns = -_RECOVERY_NS, -1
+        self._longest_unseen_ns = max(_NO_IMAGE[0], int(_NO_IMAGE[1] * NANOSECONDS / calibration.rate_hz))
 
     def reset(self, session: int, reason: str) -> None:
         """Forget everything of the old session and wait for a new start."""
