@@ -109,8 +109,11 @@ class Graph:
         while not condition():
             self.processes.check()
             if time.monotonic() - begin_s > timeout_s:
-                states = {name: status.state.value for name, status in self.listener.statuses.items()}
-                raise GraphError(f"waited for {timeout_s:g} s in vain: {states}")
+                said = (
+                    f"{name} {status.state.value} session {status.values.get('session')} lacks '{status.values.get('unmatched')}'"
+                    for name, status in self.listener.statuses.items()
+                )
+                raise GraphError(f"waited for {timeout_s:g} s in vain: {', '.join(said)}")
             self.listener.spin()
         return time.monotonic() - begin_s
 

@@ -43,6 +43,8 @@ _ASIDE_S = 1.0
 """A service under way gets this long to end when the node is stopped."""
 _STOP_S = 2.0
 _CALL_S = 10.0
+_DIGITS = 20
+"""A number of more digits is none of ours."""
 
 
 class VliNode(ManagedNode):
@@ -477,10 +479,12 @@ class VliNode(ManagedNode):
             return
         previous = self.others.get(status.node)
         self.others[status.node] = status
-        if previous is not None and _start(previous) < _start(status):
+        if previous is not None and 0 < _number(previous, "started_ns") < _number(status, "started_ns"):
             self._finished_sources.pop(status.node, None)
             self.get_logger().warning(f"'{status.node}' was started anew")
             self.enqueue(partial(self.on_restart, status.node))
+        if _number(status, "session") > self._newest_session:
+            self._begin(Session(_number(status, "session"), f"heard of from {status.node}"))
         if status.state is NodeState.FINISHED and status.values.get("session") == str(self.session):
             self._finished_sources[status.node] = status.values
 
@@ -548,7 +552,7 @@ class VliNode(ManagedNode):
         return figures
 
 
-def _start(status: StageStatus) -> int:
-    """Return when the node of a status was started; 0 where it does not say."""
-    text = status.values.get("started_ns", "")
-    return int(text) if text.isdecimal() else 0
+def _number(status: StageStatus, name: str) -> int:
+    """Return a whole number out of a status; 0 where it does not say."""
+    text = status.values.get(name, "")
+    return int(text) if text.isdecimal() and len(text) < _DIGITS else 0
