@@ -181,6 +181,8 @@ class Pipeline:
         yield window
         with self.timer.measure("mapping"):
             update = self.stages.mapper.add_window(window)
+        if update.relocalisation is not None:
+            self.stages.back_end.relocalise(update.relocalisation)
         if update.constraints is not None:
             self.stages.back_end.add_constraints(update.constraints)
         yield update

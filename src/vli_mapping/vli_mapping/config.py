@@ -178,6 +178,9 @@ class MappingConfig:
         choices=(COMPENSATED, AS_SEEN),
         doc="colours without the light that travels with the camera, so that passes do not band, or as seen",
     )
+    prior_map: str = parameter(
+        "", doc="map (.vli) of an earlier session to go on with, relative to the working directory; empty: none"
+    )
     image_buffer_s: float = parameter(
         10.0,
         unit="s",

@@ -1,7 +1,8 @@
 """The file of a whole map, from which it can be used again: a zip of plain arrays and a header; nothing in it is code.
 
-``header.json`` has format, version, number of points and the light on board; each column of the map is a ``.npy`` beside it. The
-zip's CRC-32 of every entry is checked when it is read. Entries are stored, not compressed: a map is noise to a compressor.
+``header.json`` has format, version, number of points and the light on board; each column of the map is a ``.npy`` beside it, and
+so is what its keyframes have. The zip's CRC-32 of every entry is checked when it is read. Entries are stored, not compressed: a
+map is noise to a compressor.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import tokenize
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +22,16 @@ import numpy as np
 
 from vli_common.arrays import AnyArray, FloatArray
 from vli_common.errors import InputError
+from vli_mapping.keyframe_arrays import NAMES as KEYFRAME_ARRAYS
+from vli_mapping.keyframe_arrays import pack, unpack
 from vli_mapping.light import Light
 from vli_mapping.point_map import Columns
 from vli_mapping.snapshot import Snapshot
 from vli_mapping.store import replacing
 
-FORMAT, VERSION = "vli-map", 1
+FORMAT, VERSION = "vli-map", 2
+_WITHOUT_KEYFRAMES = 1
+"""The version before, which is read as well."""
 SUFFIX = ".vli"
 _HEADER = "header.json"
 _EPOCH = (1980, 1, 1, 0, 0, 0)
@@ -72,8 +77,10 @@ def load_map(path: Path) -> Snapshot:
     with _reading(path) as archive:
         header = _read_header(path, archive)
         columns = {name: _read_array(archive, name) for name in (*_names(), _VIEWS)}
+        has_keyframes = header["version"] != _WITHOUT_KEYFRAMES
+        keyframes = unpack({name: _read_array(archive, name) for name in KEYFRAME_ARRAYS}) if has_keyframes else ()
         light = None if header["light"] is None else _light_from_json(header["light"])
-        return _checked(path, header, columns, light)
+        return replace(_checked(path, header, columns, light), keyframes=keyframes)
 
 
 def map_origin(path: Path) -> str:
@@ -119,6 +126,7 @@ def _names() -> tuple[str, ...]:
 def _arrays(snapshot: Snapshot) -> Iterator[tuple[str, AnyArray]]:
     yield from ((name, getattr(snapshot.columns, name)) for name in _names())
     yield _VIEWS, snapshot.views
+    yield from pack(snapshot.keyframes).items()
 
 
 def _read_header(path: Path, archive: zipfile.ZipFile) -> dict[str, Any]:
@@ -130,9 +138,10 @@ def _read_header(path: Path, archive: zipfile.ZipFile) -> dict[str, Any]:
     header = json.loads(archive.read(info))
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise InputError(f"'{path}' is no map: its header does not say '{FORMAT}'")
-    if header.get("version") != VERSION:
+    if header.get("version") not in (_WITHOUT_KEYFRAMES, VERSION):
         raise InputError(
-            f"map '{path}' has version '{str(header.get('version'))[:20]}', this program reads '{VERSION}'; scan again or update"
+            f"map '{path}' has version '{str(header.get('version'))[:20]}', this program reads "
+            f"'{_WITHOUT_KEYFRAMES}' and '{VERSION}'; scan again or update"
         )
     return header
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from pathlib import Path
 
 import numpy as np
 
@@ -13,9 +14,12 @@ from vli_mapping.association import associate
 from vli_mapping.config import AS_SEEN, MappingConfig
 from vli_mapping.contradiction import contradict
 from vli_mapping.light import Light, LightEstimator
+from vli_mapping.map_file import load_map
+from vli_mapping.map_keyframes import KeyframeIntake
 from vli_mapping.point_map import PointMap, Stripe, to_bytes
 from vli_mapping.scan_window import PosedScan, ScanWindow
 from vli_mapping.snapshot import Snapshot, restore
+from vli_mapping.whereabouts import Whereabouts
 
 _REFINE_DELAY = 3
 """Scans that enter after one before its normals are fitted again: by then the surface around it is there."""
@@ -40,14 +44,21 @@ class Mapper:
         self._window = ScanWindow(calibration.camera, self.config, self.counters)
         self._unrefined: list[tuple[IntArray, FloatArray]] = []
         self._light = LightEstimator()
-        self._is_foreign = False
         self._entering: deque[PosedScan] = deque()
         self._touched: list[IntArray] = []
+        self._entered_ns = 0
+        self._intake = KeyframeIntake(calibration.camera)
+        self._camera, self._is_levelled = calibration.camera, mode.uses_imu
+        self._whereabouts = self._new_whereabouts()
+        self._prior = load_map(Path(self.config.prior_map)) if self.config.prior_map else None
+        if self._prior is not None:
+            self.adopt(self._prior)
 
     def add_image(self, image: Image) -> None:
-        """Take a long image, for colour."""
+        """Take a long image, for colour and to find the way back by; meanwhile the map learns a keyframe, if one is due."""
         if self._uses_laser:
             self._window.add_image(image)
+            self._intake.learn(self.map, self._entered_ns)
 
     def add_scan(self, scan: LaserScan) -> None:
         """Take the stripe of a short frame; it waits for its pose. One that has its last pose enters the map.
@@ -70,13 +81,18 @@ class Mapper:
         if session > self._window.session:
             self.reset(session)
         self.settle()
+        self._entering.extend(self._whereabouts.follow(window))
         self._window.update(window)
-        self._let_go()
+        self._let_go(window)
         if window.final.all():
             self.settle()
-        constraints = None
-        if self.constrains and not self._is_foreign:
-            staying = self._window.staying()
+            self._intake.learn(self.map, None)
+        constraints = relocalisation = None
+        staying = self._window.staying()
+        if not self.is_located:
+            keyframes = self._window.keyframe_images(window)
+            relocalisation = self._whereabouts.seek(window, keyframes, staying, self.map)
+        elif self.constrains:
             constraints = associate(self.map, staying, window.stamp_ns, self.config.association, self.counters, session)
         cloud = _live_cloud(self._window.unpublished(), window.stamp_ns, session)
         self._window.release(window)
@@ -86,7 +102,12 @@ class Mapper:
             if len(touched)
             else None
         )
-        return MappingOutput(constraints, cloud, update)
+        return MappingOutput(constraints, cloud, update, relocalisation)
+
+    @property
+    def is_located(self) -> bool:
+        """False while the window's place in the map is not known: after a loss, or in the map of an earlier session."""
+        return self._whereabouts.is_known or not len(self.map)
 
     def cloud(self, max_points: int | None = None, stamp_ns: int = 0, session: int = 0) -> PointCloud:
         """Return the map, thinned to ``max_points`` where given; colours as the config asks for."""
@@ -108,57 +129,71 @@ class Mapper:
     def adopt(self, snapshot: Snapshot) -> None:
         """Take a map of an earlier session in place of this one's.
 
-        Poses of now and of then share no frame: until the next reset, no scan enters, and none is related to the map.
+        Poses of now and of then share no frame: until the session is found in that map, no scan enters or is related to it.
         """
-        self.settle()
-        self._touched.clear()
-        self.map = restore(snapshot, self.config.map)
-        self._light = LightEstimator(snapshot.light)
-        self._unrefined.clear()
-        self._is_foreign = True
+        self._replace(snapshot)
+        self.map.columns.entered_ns[: self.map.rows] = 0
+        self._whereabouts.begin_search()
 
     def resume(self, snapshot: Snapshot) -> None:
         """Go on with a map of this very session, which a mapper before this one has saved: their poses share a frame.
 
         The few scans that have entered the map of this one so far are dropped with it.
         """
-        self.settle()
-        self._touched.clear()
-        self.map = restore(snapshot, self.config.map)
-        self._light = LightEstimator(snapshot.light)
-        self._unrefined.clear()
-        self._window.count_from(len(snapshot.views))
+        self._replace(snapshot)
 
     def waiting(self) -> list[Stripe]:
         """Return the scans of the window as they would enter the map now, in order of time."""
-        if self._is_foreign:
+        if not self.is_located:
             return []
         return [_stripe(item) for item in self._window.staying() if item.described]
 
     def reset(self, session: int) -> None:
-        """Drop all that belongs to another session, and start a new map: poses of two sessions share no frame.
+        """Drop all that belongs to another session, and start a new map, or with the prior one: sessions share no frame.
 
         The old map stays intact for whoever holds it.
         """
         self.counters.add("sessions")
         self.settle()
         self._touched.clear()
-        self._is_foreign = False
         if len(self.map):
             self.map = PointMap(self.config.map)
         self._unrefined.clear()
+        self._intake.clear()
         self._light = LightEstimator()
         self._window = self._window.successor(session)
+        self._whereabouts.drop_held()
+        self._whereabouts = self._new_whereabouts()
+        if self._prior is not None:
+            self.adopt(self._prior)
 
-    def _let_go(self) -> None:
-        """Line up the scans that leave the window, and learn what they tell of the light."""
+    def _new_whereabouts(self) -> Whereabouts:
+        return Whereabouts(self._camera, self._is_levelled, self.counters)
+
+    def _replace(self, snapshot: Snapshot) -> None:
+        """Take another map in place of this one; scans are numbered on from those that made it."""
+        self.settle()
+        self._touched.clear()
+        self.map = restore(snapshot, self.config.map)
+        self._light = LightEstimator(snapshot.light)
+        self._unrefined.clear()
+        self._intake.clear()
+        self._window.count_from(len(snapshot.views))
+
+    def _let_go(self, window: WindowPoses) -> None:
+        """Line up the scans and keyframes that leave the window, and learn what they tell of the light."""
         leaving = list(self._window.leaving())
-        if self._is_foreign:
-            self.counters.add("scans_beside_a_loaded_map", len(leaving))
+        if not self.is_located:
+            self._whereabouts.hold(leaving)
             return
         if self._light.is_due():
             self._light.add(self._window.sightings())
         self._entering.extend(leaving)
+        if leaving:
+            depth = float(np.median([np.median(item.scan.points[:, 2]) for item in leaving]))
+            for image, row in self._window.keyframe_images(window):
+                if window.final[row]:
+                    self._intake.offer(image, window.T_map_camera[row], depth, self.map)
 
     def _enter_next(self) -> None:
         """Enter the oldest scan that waits, if one does."""
@@ -176,6 +211,7 @@ class Mapper:
         stripe, left = contradict(self.map, _stripe(item))
         target = self.map.insert(stripe)
         touched = np.unique(target[target >= 0])
+        self._entered_ns = item.scan.stamp_ns
         self.counters.add("scans_entered")
         self.counters.add("points_entered", int((target >= 0).sum()))
         self.counters.add("points_contradicted", left)

@@ -57,6 +57,7 @@ def join(whole: PointMap, snapshot: Snapshot, T_whole_snapshot: FloatArray) -> N
             )
         )
         whole.add_weight(target, c.weight[rows] - 1)
+    whole.keyframes.extend(item.moved(T_whole_snapshot) for item in snapshot.keyframes)
 
 
 def relit(snapshot: Snapshot, light: Light | None) -> Snapshot:

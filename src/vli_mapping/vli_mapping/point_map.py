@@ -10,6 +10,7 @@ from vli_common.arrays import AnyArray, BoolArray, ByteArray, Float32Array, Floa
 from vli_common.types import PointCloud
 from vli_mapping.config import MapConfig
 from vli_mapping.insertion import FREE, ROWS, insert_stripe, remove
+from vli_mapping.keyframe import MapKeyframe
 from vli_mapping.light import Light
 from vli_mapping.normals import refine_normals, smooth_normals
 from vli_mapping.spatial_hash import NONE, SpatialHash, link
@@ -129,6 +130,8 @@ class PointMap:
         self.grid = SpatialHash(CELL_M, capacity)
         self.views: FloatArray = np.zeros((0, 3, 4))
         """(S, 3, 4), pose of the camera in map by the number of the scan."""
+        self.keyframes: list[MapKeyframe] = []
+        """Views by which a scanner finds its way back, in order of time."""
         self._state = np.array([0, NONE, 0], np.int64)
         c = self.config
         self._limits = (

@@ -166,6 +166,12 @@ class ScanWindow:
             item.published = True
         return fresh
 
+    def keyframe_images(self, window: WindowPoses) -> list[tuple[Image, int]]:
+        """Return the images of the window's keyframes, as far as they are there, and their rows in it, in order of time."""
+        rows = np.flatnonzero(window.kinds == FrameKind.KEYFRAME.value)
+        found = [(self._images.get(int(window.stamps[row])), int(row)) for row in rows]
+        return [(image, row) for image, row in found if image is not None and image.session == self.session]
+
     def sightings(self) -> Sightings:
         """Return how the keyframes' images show some spots of the scans that leave, from all over the field of view."""
         points, normals = [np.empty((0, 3))], [np.empty((0, 3), np.float32)]

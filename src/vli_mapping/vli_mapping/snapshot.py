@@ -11,6 +11,7 @@ import numpy as np
 
 from vli_common.arrays import AnyArray, FloatArray
 from vli_mapping.config import MapConfig
+from vli_mapping.keyframe import MapKeyframe
 from vli_mapping.light import Light
 from vli_mapping.point_map import Columns, PointMap
 
@@ -29,12 +30,14 @@ class Snapshot:
         views: (S, 3, 4), of the scans that ``columns.seen_by`` numbers.
         light: on board, None where it is not known.
         origin: names the frame of the map among those of other sessions and back ends; empty where nobody said.
+        keyframes: views by which a scanner finds its way back.
     """
 
     columns: Columns
     views: FloatArray
     light: Light | None
     origin: str = ""
+    keyframes: tuple[MapKeyframe, ...] = ()
 
     def __len__(self) -> int:
         return len(self.columns.weight)
@@ -54,13 +57,15 @@ def take(point_map: PointMap, light: Light | None, exclusively: Exclusively = la
         chunks.append(exclusively(partial(_copy, point_map, start)))
         start += CHUNK_ROWS
     views: FloatArray = exclusively(point_map.views.copy)
-    return Snapshot(_joined(chunks), views, light)
+    keyframes: tuple[MapKeyframe, ...] = exclusively(lambda: tuple(point_map.keyframes))
+    return Snapshot(_joined(chunks), views, light, keyframes=keyframes)
 
 
 def restore(snapshot: Snapshot, config: MapConfig | None = None) -> PointMap:
     """Return a map of its own memory that holds what a snapshot does."""
     result = PointMap(config, capacity=max(len(snapshot), 1 << 16))
     result.fill(snapshot.columns, snapshot.views)
+    result.keyframes.extend(snapshot.keyframes)
     return result
 
 

@@ -11,9 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mapping_scenes import calibration, sheet, stripe
+from mapping_scenes import calibration, looking_down, sheet, stripe
 
 from vli_common.errors import InputError, OutputError
+from vli_mapping.features import DESCRIPTOR_BYTES
+from vli_mapping.keyframe import MapKeyframe
 from vli_mapping.light import Light
 from vli_mapping.map_file import load_map, save_map
 from vli_mapping.mapper import Mapper
@@ -28,10 +30,23 @@ def snapshot() -> Snapshot:
     point_map = PointMap()
     sheet(point_map, rows=20)
     point_map.refine_normals(point_map.alive(), np.array([0, 0, 1.0]))
+    point_map.keyframes.extend(keyframe(seed) for seed in range(3))
     return take(point_map, LIGHT)
 
 
+def keyframe(seed: int) -> MapKeyframe:
+    """Return a view of 30 + ``seed`` features; the second is of a camera with smaller images."""
+    rng, count = np.random.default_rng(seed), 30 + seed
+    descriptors = rng.integers(0, 256, (count, DESCRIPTOR_BYTES), dtype=np.uint8)
+    thumbnail = rng.integers(0, 256, (120 - 20 * (seed == 1), 160), dtype=np.uint8)
+    return MapKeyframe(looking_down(0.01 * seed, 0.0), 0.03, rng.normal(size=(count, 3)), descriptors, thumbnail)
+
+
 def assert_same(one: Snapshot, two: Snapshot) -> None:
+    assert len(one.keyframes) == len(two.keyframes)
+    for first, second in zip(one.keyframes, two.keyframes, strict=True):
+        for item in fields(MapKeyframe):
+            np.testing.assert_array_equal(getattr(first, item.name), getattr(second, item.name))
     for item in fields(Columns):
         np.testing.assert_array_equal(getattr(one.columns, item.name), getattr(two.columns, item.name))
     np.testing.assert_array_equal(one.views, two.views)
@@ -45,6 +60,13 @@ def test_a_map_is_loaded_as_it_was_saved(snapshot: Snapshot, tmp_path: Path) -> 
     np.testing.assert_array_equal(back.light.position, LIGHT.position)
     assert replace(back.light, position=LIGHT.position) == LIGHT
     assert [path.name for path in tmp_path.iterdir()] == ["map.vli"]
+
+
+def test_a_map_of_the_version_before_has_no_keyframes(snapshot: Snapshot, tmp_path: Path) -> None:
+    save_map(tmp_path / "map.vli", snapshot)
+    rewrite(tmp_path / "map.vli", lambda name, data: None if "keyframe" in name else header(version=1)(name, data))
+    back = load_map(tmp_path / "map.vli")
+    assert_same(back, replace(snapshot, keyframes=()))
 
 
 def test_the_same_map_is_the_same_file(snapshot: Snapshot, tmp_path: Path) -> None:
@@ -157,8 +179,15 @@ def compress(path: Path) -> None:
         (lambda path: path.write_bytes(path.read_bytes()[:-1000]), "no map or a damaged one"),
         (lambda path: rewrite(path, lambda name, data: None if name == "header.json" else data), "no 'header.json'"),
         (lambda path: rewrite(path, header(format="other")), "does not say 'vli-map'"),
-        (lambda path: rewrite(path, header(version=99)), "version '99', this program reads '1'"),
+        (lambda path: rewrite(path, header(version=99)), "version '99', this program reads '1' and '2'"),
         (lambda path: rewrite(path, header(points=7)), "do not belong together"),
+        (lambda path: rewrite(path, lambda name, data: None if "descriptors" in name else data), "damaged.*descriptors"),
+        (lambda path: rewrite(path, column("keyframe_poses", lambda values: 2 * values)), "damaged.*keyframes are nowhere"),
+        (lambda path: rewrite(path, column("keyframe_points", lambda values: np.nan * values)), "damaged.*keyframes are nowhere"),
+        (lambda path: rewrite(path, column("keyframe_depths", lambda values: -values)), "damaged.*keyframes are nowhere"),
+        (lambda path: rewrite(path, column("keyframe_sizes", lambda values: values + 1)), "damaged.*belong to their features"),
+        (lambda path: rewrite(path, column("keyframe_sizes", lambda values: -values)), "damaged.*do not belong together"),
+        (lambda path: rewrite(path, column("keyframe_shapes", lambda values: values * 10**9)), "damaged.*more than there is"),
         (lambda path: rewrite(path, header(light={"position": [0]})), "damaged"),
         (lambda path: rewrite(path, lambda name, data: None if name == "colour.npy" else data), "damaged.*colour"),
         (lambda path: rewrite(path, lambda name, data: b"junk" if name == "colour.npy" else data), "damaged"),
@@ -228,8 +257,9 @@ def test_scans_do_not_enter_a_map_of_an_earlier_session_until_the_mapper_is_rese
     before = len(mapper.map)
     run(mapper, 0, 41)
     assert len(mapper.map) == before
-    assert mapper.counters["scans_beside_a_loaded_map"] == 20
+    assert not mapper.is_located
     assert mapper.light() is LIGHT
     mapper.reset(1)
+    assert mapper.counters["scans_unlocated"] == 20
     run(mapper, 0, 41, session=1)
     assert mapper.counters["scans_entered"] == 20

@@ -18,12 +18,13 @@ from vli_common.messages import (
     cloud_to_message,
     constraints_to_message,
     image_from_message,
+    relocalisation_to_message,
     scan_from_message,
     window_from_message,
 )
 from vli_common.node import VliNode, run_node
 from vli_common.status import Health
-from vli_common.topics import CLOUD, IMAGE_LONG, LASER_POINTS, MAP, MAP_CONSTRAINTS, MAP_UPDATE, WINDOW
+from vli_common.topics import CLOUD, IMAGE_LONG, LASER_POINTS, MAP, MAP_CONSTRAINTS, MAP_UPDATE, RELOCALISATION, WINDOW
 from vli_common.types import Counters, Image, LaserScan, PointCloud, WindowPoses
 from vli_mapping.config import AS_SEEN, MappingConfig
 from vli_mapping.export import write_cloud
@@ -66,7 +67,7 @@ class MappingNode(VliNode):
         super().__init__("mapping_node", {MappingConfig: "", StoreConfig: ""})
         self._mapper: Mapper | None = None
         self._published_points = -1
-        for topic in (CLOUD, MAP, MAP_UPDATE, MAP_CONSTRAINTS):
+        for topic in (CLOUD, MAP, MAP_UPDATE, MAP_CONSTRAINTS, RELOCALISATION):
             self.advertise(topic)
         self.receive(IMAGE_LONG, self._read_image, self._on_image, limit=_WAITING_IMAGES)
         self.receive(LASER_POINTS, scan_from_message, self._on_scan)
@@ -128,6 +129,8 @@ class MappingNode(VliNode):
 
     def _on_window(self, window: WindowPoses) -> None:
         output = self.mapper.add_window(window)
+        if output.relocalisation is not None:
+            self.send(RELOCALISATION, relocalisation_to_message(output.relocalisation))
         if output.constraints is not None:
             self.send(MAP_CONSTRAINTS, constraints_to_message(output.constraints))
         if output.cloud is not None and self.has_listener(CLOUD):
@@ -159,7 +162,7 @@ class MappingNode(VliNode):
         path = self._path("load_path")
         snapshot = load_map(path)
         self.call(lambda: self.mapper.adopt(snapshot))
-        return f"{len(snapshot)} points from '{path}'; scans enter again after ~/clear"
+        return f"{len(snapshot)} points from '{path}'; scans enter once the scanner has found its place in it"
 
     def _export(self) -> str:
         path = self._path("export_path")

@@ -1,0 +1,138 @@
+"""Where in the map an image was taken, by features: hypotheses of single views, and what all views together say of each.
+
+A feature looks for its like among those of all keyframes of the map; the keyframes with the most votes are matched one by one,
+and each gives a pose by PnP and RANSAC. Things repeat (a keyboard's keys every 19 mm), so a hypothesis counts by the matches of
+all views that agree with it, and against the best that is somewhere else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from vli_common.arrays import ByteArray, FloatArray, IntArray
+from vli_common.camera import CameraModel
+from vli_common.geometry import inverse, pose, so3_exp, transform
+from vli_mapping.features import ImageFeatures
+from vli_mapping.keyframe import MapKeyframe
+
+_MAX_DISTANCE = 64
+"""Bits, of 256, in which descriptors of the same corner may differ."""
+_NEIGHBOURS, _KEYFRAMES = 6, 6
+_VOTERS = 150
+"""Features of a map keyframe that vote, the strongest: their number decides what a large map costs."""
+_TOLERANCE_PX = 4.0
+"""Of a match: poses of the window and of the map, and the place of a corner at half resolution."""
+_RANSAC_ITERATIONS = 200
+_MIN_MATCHES = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """Matches of one view with the map.
+
+    Args:
+        stamp_ns: of the view.
+        T_session_camera: (4, 4).
+        rays: (M, 2), of the features, undistorted, normalised; one that matches several keyframes is there several times.
+        points: (M, 3), map, what they match.
+        features: (M,), which feature each is.
+    """
+
+    stamp_ns: int
+    T_session_camera: FloatArray
+    rays: FloatArray
+    points: FloatArray
+    features: IntArray
+
+
+class PlaceIndex:
+    """Finds the features of an image among those of a map's keyframes.
+
+    Args:
+        keyframes: of the map.
+        camera: of the images to come.
+    """
+
+    def __init__(self, keyframes: Sequence[MapKeyframe], camera: CameraModel) -> None:
+        self._keyframes = keyframes
+        self._camera = camera
+        voters = [item.descriptors[:_VOTERS] for item in keyframes]
+        self._owner = np.repeat(np.arange(len(voters)), [len(item) for item in voters])
+        self._descriptors = np.concatenate(voters) if voters else np.empty((0, 32), np.uint8)
+
+    def __len__(self) -> int:
+        return len(self._keyframes)
+
+    def match(self, stamp_ns: int, features: ImageFeatures, T_session_camera: FloatArray) -> tuple[Evidence, list[FloatArray]]:
+        """Return the matches of an image with the keyframes most like it, and hypotheses T_map_session (4, 4) from each."""
+        rays = self._camera.unproject(features.pixels)
+        pairs = [(key, *self._pairs(features, key)) for key in self._most_alike(features)]
+        hypotheses = []
+        for key, mine, other in pairs:
+            T_map_camera = self._locate(self._keyframes[key].points[other], rays[mine])
+            if T_map_camera is not None:
+                hypotheses.append(T_map_camera @ inverse(T_session_camera))
+        which = np.concatenate([np.empty(0, np.int64), *(mine for _, mine, _ in pairs)])
+        points = np.concatenate([np.empty((0, 3)), *(self._keyframes[key].points[other] for key, _, other in pairs)])
+        return Evidence(stamp_ns, T_session_camera, rays[which], points, which), hypotheses
+
+    def support(self, evidence: Sequence[Evidence], T_map_session: FloatArray) -> int:
+        """Return how many features of all views are where the map says, if a hypothesis is true."""
+        limit = _TOLERANCE_PX / self._camera.focal_px
+        total = 0
+        for item in evidence:
+            local = transform(inverse(T_map_session @ item.T_session_camera), item.points)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                off = np.hypot(*(local[:, :2] / local[:, 2:] - item.rays).T)
+            total += len(np.unique(item.features[(off < limit) & (local[:, 2] > 0)]))
+        return total
+
+    def _most_alike(self, features: ImageFeatures) -> list[int]:
+        """Return the keyframes with the most features like those of an image, best first."""
+        count = min(_NEIGHBOURS, len(self._descriptors))
+        if not count or not len(features):
+            return []
+        distance, nearest = _nearest(features.descriptors, self._descriptors, count)
+        owners = self._owner[nearest]
+        votes = np.zeros(len(self._keyframes), np.int64)
+        for row, near in zip(owners, distance <= _MAX_DISTANCE, strict=True):
+            votes[np.unique(row[near])] += 1
+        ranked = np.argsort(-votes, kind="stable")[:_KEYFRAMES]
+        return [int(key) for key in ranked if votes[key] >= _MIN_MATCHES]
+
+    def _pairs(self, features: ImageFeatures, key: int) -> tuple[IntArray, IntArray]:
+        """Return the features of an image and those of a keyframe that are each other's nearest."""
+        theirs = self._keyframes[key].descriptors
+        distance, to_theirs = _nearest(features.descriptors, theirs, 1)
+        _, to_mine = _nearest(theirs, features.descriptors, 1)
+        mine = np.arange(len(features))
+        mutual = (to_mine[to_theirs[:, 0], 0] == mine) & (distance[:, 0] <= _MAX_DISTANCE)
+        return mine[mutual], to_theirs[mutual, 0]
+
+    def _locate(self, points: FloatArray, rays: FloatArray) -> FloatArray | None:
+        """Return T_map_camera (4, 4) by PnP and RANSAC, whose random numbers OpenCV always seeds alike; None without one."""
+        if len(points) < _MIN_MATCHES:
+            return None
+        found, rotation, translation, inliers = cv2.solvePnPRansac(
+            np.ascontiguousarray(points),
+            np.ascontiguousarray(rays[:, None]),
+            np.eye(3),
+            None,
+            iterationsCount=_RANSAC_ITERATIONS,
+            reprojectionError=_TOLERANCE_PX / self._camera.focal_px,
+            flags=cv2.SOLVEPNP_AP3P,
+        )
+        if not found or inliers is None or len(inliers) < _MIN_MATCHES:
+            return None
+        T_camera_map = pose(so3_exp(np.asarray(rotation, np.float64)[:, 0]), np.asarray(translation, np.float64)[:, 0])
+        return inverse(T_camera_map) if np.isfinite(T_camera_map).all() else None
+
+
+def _nearest(queries: ByteArray, others: ByteArray, count: int) -> tuple[IntArray, IntArray]:
+    """Return Hamming distances and rows (N, count) of the nearest of ``others``, nearest first."""
+    distance, index = cv2.batchDistance(queries, others, cv2.CV_32S, normType=cv2.NORM_HAMMING, K=count)
+    return np.asarray(distance, np.int64), np.asarray(index, np.int64)
