@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import rclpy
+from rclpy.clock import Clock, ClockType
 from rclpy.publisher import Publisher
 from std_msgs.msg import Header, String
 from std_srvs.srv import Trigger
@@ -79,6 +80,7 @@ class VliNode(ManagedNode):
         self._calibration_hint = ""
         self._worker = Worker(name, self.fail)
         self._aside = Aside(name)
+        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._backlog = Backlog()
         self.is_behind = False
         """True where the message that is being handled came too long ago, and those before it too: leave out what can be."""
@@ -225,6 +227,13 @@ class VliNode(ManagedNode):
 
         self.create_service(Trigger, f"~/{name}", answer)
 
+    def every(self, period_s: float, action: Callable[[], None]) -> None:
+        """Run an action in the executor again and again, by the machine's own clock.
+
+        With ``use_sim_time`` the clock of ROS stands still while nobody plays: a node must answer all the same.
+        """
+        self.create_timer(period_s, action, clock=self._steady)
+
     def enqueue(self, job: Callable[[], None]) -> None:
         """Run a job in the worker, after all that waits there."""
         self._worker.control(job)
@@ -340,10 +349,10 @@ class VliNode(ManagedNode):
         self.create_subscription(Header, SESSION.name, self._on_session_message, quality(SESSION))
         self.create_subscription(message_type(STATUS), STATUS.name, self._on_status, quality(STATUS, reading=True))
         self.create_subscription(String, CALIBRATION.name, self._on_calibration, quality(CALIBRATION))
-        self.create_timer(_STATUS_PERIOD_S, self.publish_status)
-        self.create_timer(_FINISH_PERIOD_S, self._check_finish)
-        self.create_timer(_FINISH_PERIOD_S, self._tell_links)
-        self.create_timer(_STATUS_PERIOD_S, self._match)
+        self.every(_STATUS_PERIOD_S, self.publish_status)
+        self.every(_FINISH_PERIOD_S, self._check_finish)
+        self.every(_FINISH_PERIOD_S, self._tell_links)
+        self.every(_STATUS_PERIOD_S, self._match)
         self.serve("reset", lambda: f"session {self.raise_session(f'reset of {self.get_name()}').number}")
         self.serve("pause", self._pause)
         self.serve("resume", self._resume)

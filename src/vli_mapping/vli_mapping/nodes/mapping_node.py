@@ -78,9 +78,9 @@ class MappingNode(VliNode):
         self.serve("clear", self._clear, aside=True)
         self._is_resumed = False
         self._saving = threading.Lock()
-        self.create_timer(_AUTOSAVE_CHECK_S, self._look_after_autosave)
+        self.every(_AUTOSAVE_CHECK_S, self._look_after_autosave)
         self._autosaved_s = time.monotonic()
-        self.create_timer(_MAP_PERIOD_S, lambda: self.enqueue(self._publish_map))
+        self.every(_MAP_PERIOD_S, lambda: self.enqueue(self._publish_map))
 
     def create_stage(self, calibration: Calibration | None) -> None:
         """Make the mapper."""
