@@ -17,16 +17,13 @@ from vli_bringup.arguments import add_scan_arguments, bag_topics, source_setting
 from vli_bringup.input_checks import check_input, check_part
 from vli_bringup.output import CONFIG, SUMMARY, ResultsDirectory
 from vli_bringup.pipeline import Pipeline, Stages
-from vli_bringup.recorder import Recorder
+from vli_bringup.sessions import Sessions, write_map
 from vli_bringup.settings import Settings, to_yaml
 from vli_bringup.warm_up import warm_up
 from vli_common.calibration import load_calibration
 from vli_common.types import NANOSECONDS, EncodedImage, ImuSample, Mode
 from vli_driver.bag import BagReader
-from vli_mapping.map_file import SUFFIX, save_map
 from vli_mapping.render import write_views
-from vli_mapping.snapshot import take
-from vli_mapping.store import write_ply
 
 NEVER_TRACKED = 1
 _SWITCH_S = 2e-4
@@ -83,12 +80,12 @@ def run(args: argparse.Namespace) -> int:
         _share_processor()
         warm_up()
         pipeline = Pipeline(Stages.create(calibration, settings, mode), mode)
-        recorder = Recorder(calibration)
-        clock = process(reader, pipeline, recorder, _duration_s(reader, args.start, args.duration), args.started_s)
-        write(directory, pipeline, recorder, clock, settings)
-    for warning in [*warnings, *reader.warnings, *_losses(pipeline)]:
+        sessions = Sessions(directory, calibration, pipeline)
+        clock = process(reader, pipeline, sessions, _duration_s(reader, args.start, args.duration), args.started_s)
+        write(directory, pipeline, sessions, clock, settings)
+    for warning in [*warnings, *reader.warnings, *_losses(pipeline), *_earlier(sessions, results.path)]:
         _note(f"warning: {warning}")
-    return report(pipeline, recorder, results.path)
+    return report(pipeline, sessions, results.path)
 
 
 def _share_processor() -> None:
@@ -97,13 +94,13 @@ def _share_processor() -> None:
     cv2.setNumThreads(1)
 
 
-def process(reader: BagReader, pipeline: Pipeline, recorder: Recorder, duration_s: float, started_s: float) -> Clock:
+def process(reader: BagReader, pipeline: Pipeline, sessions: Sessions, duration_s: float, started_s: float) -> Clock:
     """Push everything the reader has through the pipeline and record what comes out.
 
     Args:
         reader: of the part of the bag that is asked for.
         pipeline: fresh.
-        recorder: fresh.
+        sessions: fresh.
         duration_s: seconds of bag to expect, for the progress bar.
         started_s: ``time.perf_counter()`` when the command started.
     """
@@ -111,42 +108,40 @@ def process(reader: BagReader, pipeline: Pipeline, recorder: Recorder, duration_
     bag_s = 0.0
     for item, elapsed_s in _with_progress(reader, duration_s):
         bag_s = elapsed_s
-        recorder.add(pipeline.push(item))
-    recorder.add(pipeline.flush())
+        sessions.add(pipeline.push(item))
+    sessions.add(pipeline.flush())
     end_s = time.perf_counter()
     return Clock(begin_s - started_s, end_s - begin_s, time.process_time(), bag_s)
 
 
-def write(directory: Path, pipeline: Pipeline, recorder: Recorder, clock: Clock, settings: Settings) -> None:
+def write(directory: Path, pipeline: Pipeline, sessions: Sessions, clock: Clock, settings: Settings) -> None:
     """Write trajectories, map, picture, times, parameters and summary."""
-    recorder.write(directory)
-    cloud = pipeline.stages.mapper.cloud()
-    write_ply(directory / "map.ply", cloud)
-    save_map(directory / f"map{SUFFIX}", take(pipeline.stages.mapper.map, pipeline.stages.mapper.light()))
-    write_views(directory / "cloud.png", cloud)
+    sessions.recorder.write(directory)
+    points = write_map(directory, pipeline.stages.mapper)
+    write_views(directory / "cloud.png", pipeline.stages.mapper.cloud())
     pipeline.timer.write(directory / "timing.csv")
     (directory / CONFIG).write_text(to_yaml(settings))
     summary = {
         "frames_long": pipeline.counters["long_images"],
         "frames_short": pipeline.counters["short_images"],
-        "keyframes": recorder.keyframes,
-        "points": len(cloud),
-        "states": recorder.states,
+        "keyframes": sessions.keyframes,
+        "points": points,
+        "states": sessions.recorder.states,
         **clock.summary(),
         **pipeline.timer.summary(),
     }
     (directory / SUMMARY).write_text(json.dumps(summary, indent=1) + "\n")
 
 
-def report(pipeline: Pipeline, recorder: Recorder, path: Path) -> int:
+def report(pipeline: Pipeline, sessions: Sessions, path: Path) -> int:
     """Say what came out; return the exit code."""
     long_frames = pipeline.counters["long_images"]
-    if not recorder.live:
-        _note(f"tracking never started in {long_frames} long frames: {recorder.reason}")
+    if not sessions.poses:
+        _note(f"tracking never started in {long_frames} long frames: {sessions.recorder.reason}")
         return NEVER_TRACKED
     figures = pipeline.timer.summary()
     print(
-        f"{len(recorder.live)} poses of {long_frames} long frames, {len(pipeline.stages.mapper.map)} map points, "
+        f"{sessions.poses} poses of {long_frames} long frames, {len(pipeline.stages.mapper.map)} map points, "
         f"{figures['ms_per_frame_mean']} ms a frame; results in '{path}'"
     )
     return 0
@@ -171,9 +166,23 @@ def _duration_s(reader: BagReader, start_s: float, duration_s: float | None) -> 
 
 
 def _losses(pipeline: Pipeline) -> list[str]:
-    """Return a line for each kind of image that the pipeline had to leave out."""
-    counts = {name: pipeline.counters[name] for name in ("undecodable_images", "images_of_another_shape")}
-    return [f"{count} {name.replace('_', ' ')} were left out" for name, count in counts.items() if count]
+    """Return a line for each kind of data that had to be left out."""
+    front_end = pipeline.stages.front_end.counters
+    counts = {
+        "undecodable images": pipeline.counters["undecodable_images"],
+        "images of another shape": pipeline.counters["images_of_another_shape"],
+        "IMU samples that are not finite": front_end["imu_not_finite"],
+        "IMU samples that came too late": front_end["imu_too_late"],
+    }
+    return [f"{count} {what} were left out" for what, count in counts.items() if count]
+
+
+def _earlier(sessions: Sessions, path: Path) -> list[str]:
+    """Return a line that says where earlier sessions are, where there were any."""
+    if not sessions.kept:
+        return []
+    found = ", ".join(f"'{path / name}'" for name in sessions.kept)
+    return [f"the clock jumped, and what was scanned before is in {found}; join the maps with: vli merge"]
 
 
 def _note(text: str) -> None:

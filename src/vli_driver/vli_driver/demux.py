@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from vli_common.clock import ClockMonitor
 from vli_common.types import NANOSECONDS, Counters, Exposure, Image
 from vli_driver.brightness import brightness
 from vli_driver.config import DemuxConfig
@@ -23,7 +24,6 @@ _LOCK_FRAMES = 4
 _LATE_LOCK_FRAMES = 60
 _MOST_WAITING = 600
 """Frames that wait for a verdict, however close their stamps are."""
-_CLOCK_JUMP_NS = NANOSECONDS
 _HYSTERESIS = 0.15
 """Share of the contrast, around the middle of the two levels, in which brightness says nothing."""
 
@@ -105,6 +105,7 @@ class Demultiplexer:
     def __init__(self, config: DemuxConfig | None = None) -> None:
         self.config = config or DemuxConfig()
         self.counters = Counters()
+        self._clock = ClockMonitor()
         self.reset()
 
     def reset(self) -> None:
@@ -122,13 +123,13 @@ class Demultiplexer:
     def push(self, image: Image) -> SortedFrames:
         """Take the next image; return those that are decided by now, in order (none while the start is undecided)."""
         ready: SortedFrames = []
-        if self._last_ns is not None and image.stamp_ns <= self._last_ns:
-            if image.stamp_ns > self._last_ns - _CLOCK_JUMP_NS:
-                self.counters.add("duplicate" if image.stamp_ns == self._last_ns else "out_of_order")
-                return []
+        if self._clock.jump("camera", image.stamp_ns):
             self.counters.add("clock_jump")
             ready = self.flush()
             self.reset()
+        elif self._last_ns is not None and image.stamp_ns <= self._last_ns:
+            self.counters.add("duplicate" if image.stamp_ns == self._last_ns else "out_of_order")
+            return []
         frame = self._measure(image)
         if image.laser_on is not None:
             return ready + self._sort_known(frame)
