@@ -283,7 +283,8 @@ def test_replay_of_a_recording_tracks_and_maps_what_the_scanner_saw(tmp_path: Pa
     assert summary["frames_with_pose"] >= 0.9 * summary["frames_long"]
     assert summary["points"] > 10_000
     assert {path.name for path in out.iterdir()} == {
-        "cloud.png", "config.yaml", "map.ply", "summary.json", "trajectory.tum", "trajectory_final.tum",
+        "cloud.png", "config.yaml", "covariance.csv", "map.ply", "map.vli", "summary.json", "timing.csv", "trajectory.tum",
+        "trajectory_final.tum",
     }  # fmt: skip
     for name in ("trajectory.tum", "trajectory_final.tum"):
         assert rmse(np.loadtxt(out / name), np.loadtxt(recording / "truth.tum")) < 3e-4

@@ -19,6 +19,12 @@ _TOPICS = {"image": "image_topic", "imu": "imu_topic", "camera_info": "camera_in
 def add_scan_arguments(parser: argparse.ArgumentParser) -> None:
     """Add bag, calibration, output, mode, parameters and the choice of topics and time."""
     parser.add_argument("bag", metavar="BAG", type=Path, help="rosbag2 directory or bare .mcap")
+    add_result_arguments(parser)
+    add_source_arguments(parser)
+
+
+def add_result_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add calibration, output and mode."""
     parser.add_argument("--calib", metavar="C", type=Path, required=True, help="calibration file")
     parser.add_argument("--out", metavar="DIR", type=Path, help="results (default: results/STAMP, and the link results/latest)")
     parser.add_argument("--overwrite", action="store_true", help="replace the results in DIR")
@@ -26,20 +32,24 @@ def add_scan_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--mode", choices=modes, default=modes[0], help="all | no window-to-map | no laser | no IMU (default: %(default)s)"
     )
-    add_source_arguments(parser)
 
 
 def add_source_arguments(parser: argparse.ArgumentParser) -> None:
     """Add Kalibr's IMU file, parameters, and the choice of topics and time."""
+    add_parameter_arguments(parser)
+    parser.add_argument("--start", metavar="S", type=_seconds, default=0.0, help="skip the first S seconds")
+    parser.add_argument("--duration", metavar="D", type=duration, help="stop after D seconds")
+    add_topic_argument(parser)
+
+
+def add_parameter_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add Kalibr's IMU file and parameters."""
     parser.add_argument("--imu-calib", metavar="F", type=Path, help="Kalibr's separate IMU file")
     parser.add_argument(
         "--colour", choices=(COMPENSATED, AS_SEEN), help="of the map: without the light on board (default), or as seen"
     )
     parser.add_argument("--config", metavar="F", type=Path, help="parameters, in the form of config/vli.yaml")
     parser.add_argument("--set", metavar="STAGE.KEY=VALUE", action="append", default=[], help="one parameter; may be repeated")
-    parser.add_argument("--start", metavar="S", type=_seconds, default=0.0, help="skip the first S seconds")
-    parser.add_argument("--duration", metavar="D", type=duration, help="stop after D seconds")
-    add_topic_argument(parser)
 
 
 def add_topic_argument(parser: argparse.ArgumentParser) -> None:

@@ -17,6 +17,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("vli_bringup.demo", "scan the bag that comes with the project, through the node graph"),
     "run": ("vli_bringup.run", "a bag to trajectory and map, offline, as fast as the machine goes"),
     "replay": ("vli_bringup.replay", "a bag through the node graph, at the bag's pace"),
+    "live": ("vli_bringup.live", "the node graph for a scanner that runs"),
     "simulate": ("vli_simulation.cli", "make a bag with truth"),
     "calibrate": ("vli_calibration.cli", "camera, laser plane, IMU: make a calibration and say what it is worth"),
     "record": ("vli_bringup.record", "what the scanner sends, to a bag"),

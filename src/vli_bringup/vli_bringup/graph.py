@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from vli_common.types import Mode
+from vli_driver.config import DriverConfig
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,6 +69,7 @@ def describe_graph(
     playback: Playback | None = None,
     save_path: Path | None = None,
     audience: str | None = None,
+    sensor: DriverConfig | None = None,
 ) -> list[NodeDescription]:
     """Return every node of the graph.
 
@@ -78,6 +80,7 @@ def describe_graph(
         playback: the bag to play; None for a graph that waits for a camera and an IMU.
         save_path: where mapping saves the map.
         audience: a node outside the graph that the playback waits for as well.
+        sensor: topics of a camera and an IMU that are there; what plays a bag publishes under the names of the table.
     """
     shared: dict[str, Any] = {"mode": mode.value}
     source = {**shared, "calibration_file": str(calibration.absolute())}
@@ -92,6 +95,12 @@ def describe_graph(
             "duration": playback.duration_s or 0.0,
             "wait_for": ",".join([*awaited, audience] if audience else awaited),
         }
-    own = {"mapping_node": {"save_path": str(save_path.absolute())}} if save_path is not None else {}
+    own: dict[str, dict[str, Any]] = {"mapping_node": {"save_path": str(save_path.absolute())}} if save_path else {}
+    if sensor is not None and playback is None:
+        image = sensor.image_topic.removesuffix("/compressed")
+        own |= {
+            "demux_node": {"image_topic": image, "exposure_topic": sensor.exposure_topic},
+            "frontend_node": {"imu_topic": sensor.imu_topic},
+        }
     nodes = [NodeDescription("vli_driver", SCANNER, source, respawn=playback is None)]
     return nodes + [NodeDescription(package, name, {**shared, **own.get(name, {})}) for package, name in STAGES]

@@ -7,18 +7,30 @@ from collections.abc import Callable
 from typing import Any
 
 import rclpy
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
 from vli_bringup.graph import STAGES
+from vli_bringup.latency import FrameLatencies
 from vli_bringup.processes import GraphError
 from vli_bringup.recorder import Recorder
-from vli_common.messages import pose_from_message, status_from_message, status_to_message, window_from_message
+from vli_common.arrays import FloatArray
+from vli_common.geometry import inverse
+from vli_common.messages import (
+    from_time,
+    odometry_from_message,
+    pose_from_message,
+    status_from_message,
+    status_to_message,
+    window_from_message,
+)
 from vli_common.node.transport import message_type, quality, set_transport_profile
 from vli_common.status import Health, NodeState, StageStatus
-from vli_common.topics import BIAS, NAMESPACE, POSE, STATUS, WINDOW, Topic
+from vli_common.topics import BIAS, NAMESPACE, ODOMETRY, POSE, STATUS, WINDOW, Topic
 from vli_common.types import Counters, TrackingState
 
 LISTENER = "replay"
@@ -26,20 +38,24 @@ LISTENER = "replay"
 
 _SPIN_S = 0.1
 _BACK_END = "backend_node"
-_RECORDED = (POSE, WINDOW)
+_RECORDED = (POSE, WINDOW, ODOMETRY)
 
 
 class GraphListener:
     """Collects what the nodes publish into a :class:`Recorder`; use as a context manager.
 
     Args:
-        recorder: gets poses, windows and states.
+        recorder: gets poses with their covariances, windows and states.
+        latencies: gets when poses came and when the driver's frames were due.
     """
 
-    def __init__(self, recorder: Recorder) -> None:
+    def __init__(self, recorder: Recorder, latencies: FrameLatencies | None = None) -> None:
         self.statuses: dict[str, StageStatus] = {}
         """The newest status of each node."""
         self._recorder = recorder
+        self._latencies = latencies or FrameLatencies()
+        self._poses: dict[int, FloatArray] = {}
+        self._odometries: dict[int, Odometry] = {}
         self._received = Counters()
         self.node: Node
         """The listener's own, while it is in the graph."""
@@ -53,8 +69,8 @@ class GraphListener:
         self._executor.add_node(self.node)
         self._publisher = self.node.create_publisher(message_type(STATUS), STATUS.name, quality(STATUS))
         self._subscribe(STATUS, self._on_status)
-        recorded = [self._subscribe(POSE, self._on_pose), self._subscribe(WINDOW, self._on_window)]
-        self._recorded = dict(zip(_RECORDED, recorded, strict=True))
+        handlers: dict[Topic, Callable[..., None]] = {POSE: self._on_pose, WINDOW: self._on_window, ODOMETRY: self._on_odometry}
+        self._recorded = {topic: self._subscribe(topic, handle) for topic, handle in handlers.items()}
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -134,12 +150,31 @@ class GraphListener:
         values = {"session": str(sessions.pop()), "unmatched": ",".join([*silent, *unmatched])}
         self._publisher.publish(status_to_message(StageStatus(time.time_ns(), LISTENER, Health.OK, NodeState.READY, "", values)))
 
-    def _subscribe(self, topic: Topic, handle: Callable[[Any], None]) -> Subscription:
+    def _subscribe(self, topic: Topic, handle: Callable[..., None]) -> Subscription:
         return self.node.create_subscription(message_type(topic), topic.name, handle, quality(topic, reading=True))
 
-    def _on_pose(self, message: Any) -> None:
+    def _on_pose(self, message: PoseStamped, info: dict[str, Any]) -> None:
         self._received.add(POSE.name)
-        self._recorder.add_pose(*pose_from_message(message))
+        stamp_ns, T_map_imu = pose_from_message(message)
+        self._latencies.add_pose(stamp_ns, int(info["received_timestamp"]))
+        self._recorder.add_pose(stamp_ns, T_map_imu)
+        self._poses[stamp_ns] = T_map_imu
+        self._join(stamp_ns)
+
+    def _on_odometry(self, message: Odometry) -> None:
+        self._received.add(ODOMETRY.name)
+        stamp_ns = from_time(message.header.stamp)
+        self._odometries[stamp_ns] = message
+        self._join(stamp_ns)
+
+    def _join(self, stamp_ns: int) -> None:
+        """Record the covariance, which the odometry has about the axes of ``odom``, once the pose in ``map`` is there too."""
+        if stamp_ns not in self._poses or stamp_ns not in self._odometries:
+            return
+        T_map_imu, message = self._poses.pop(stamp_ns), self._odometries.pop(stamp_ns)
+        T_odom_imu = odometry_from_message(message).T_map_imu
+        estimate = odometry_from_message(message, T_map_imu @ inverse(T_odom_imu))
+        self._recorder.add_pose(stamp_ns, T_map_imu, estimate.covariance)
 
     def _on_window(self, message: Any) -> None:
         self._received.add(WINDOW.name)
@@ -150,6 +185,8 @@ class GraphListener:
         if status.node == LISTENER:
             return
         self.statuses[status.node] = status
+        if "due_stamp_ns" in status.values:
+            self._latencies.add_due(int(status.values["due_stamp_ns"]), int(status.values["due_wall_ns"]))
         if status.node == _BACK_END and "tracking" in status.values:
             values = status.values
             self._recorder.add_state(int(values["stamp_ns"]), TrackingState(values["tracking"]), values["reason"])

@@ -57,7 +57,7 @@ class Recorder:
         (directory / "trajectory.tum").write_text(tum_text(self.live))
         (directory / "trajectory_final.tum").write_text(tum_text(final))
         if self.covariances:
-            (directory / COVARIANCES).write_text(covariance_text(self.covariances))
+            (directory / COVARIANCES).write_text(covariance_text(dict(sorted(self.covariances.items()))))
 
     def add_pose(self, stamp_ns: int, T_map_imu: FloatArray, covariance: FloatArray | None = None) -> None:
         """Take the pose of one long frame, as published, and its covariance (6, 6), where that is known."""

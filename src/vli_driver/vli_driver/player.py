@@ -55,6 +55,8 @@ class BagPlayer:
         self._stopped, self._running = threading.Event(), threading.Event()
         self._running.set()
         self._anchor: tuple[float, int] | None = None
+        self.due: tuple[int, int] | None = None
+        """A stamp and the wall clock (ns) at which it was due; those that follow are due in proportion to the rate."""
 
     def play(self, items: Iterable[EncodedImage | ImuSample]) -> bool:
         """Play to the end; return False where it was stopped before."""
@@ -91,6 +93,7 @@ class BagPlayer:
         now_s = self._clock()
         if self._anchor is None or abs(stamp_ns - self.position_ns) > _GAP_NS:
             self._anchor = (now_s, stamp_ns)
+            self.due = (stamp_ns, time.time_ns())
         due_s = self._anchor[0] + (stamp_ns - self._anchor[1]) / NANOSECONDS / self._rate
         self.counters.add("late", int(now_s - due_s > _LATE_S))
         if due_s > now_s:

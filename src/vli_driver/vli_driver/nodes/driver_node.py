@@ -70,10 +70,13 @@ class DriverNode(VliNode):
         return self._player.counters
 
     def stage_status(self) -> tuple[Health, str, dict[str, str]]:
-        """Return the position in the bag."""
+        """Return the position in the bag, and which stamp was due when."""
         late = self._player.counters["late"]
         hint = f"{late} items were late: the machine does not keep the pace of the bag" if late else ""
-        return Health.WARN if late else Health.OK, hint, {"position_ns": str(self._player.position_ns)}
+        values = {"position_ns": str(self._player.position_ns)}
+        if self._player.due is not None:
+            values |= dict(zip(("due_stamp_ns", "due_wall_ns"), map(str, self._player.due), strict=True))
+        return Health.WARN if late else Health.OK, hint, values
 
     def close(self) -> bool:
         """Stop the playback, then the node."""
