@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections import deque
 from typing import Any
 
@@ -205,7 +204,7 @@ class BackEndNode(VliNode):
 
 def main() -> None:
     """Run the node."""
-    sys.exit(run_node(BackEndNode))
+    run_node(BackEndNode)
 
 
 if __name__ == "__main__":

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import faulthandler
+import gc
 import os
 import sys
 import threading
 import time
 from collections.abc import Callable
+from typing import NoReturn
 
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
@@ -33,24 +35,27 @@ _UNUSABLE = 2
 _FAILED = 1
 
 
-def run_node(factory: Callable[[], VliNode]) -> int:
-    """Run a node until it is told to stop.
+def run_node(factory: Callable[[], VliNode]) -> NoReturn:
+    """Run a node until it is told to stop, and end the process.
 
-    Returns:
-        0 stopped by a signal, 1 a stage failed, 2 it could not start (one line says why).
+    Its exit code is 0 stopped by a signal, 1 a stage failed, 2 it could not start (one line says why).
     """
     sys.setswitchinterval(_SWITCH_S)
     set_transport_profile()
     take_over()
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     code, stopped = _run(factory)
+    context = rclpy.get_default_context()
     rclpy.try_shutdown()
-    if not stopped:
-        # A kernel that is being compiled cannot be interrupted, and an interpreter must not end under it.
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
-    return code
+    if stopped:
+        # With the last handle the middleware gives back its shared memory.
+        gc.collect()
+        context.destroy()
+    # Nothing is left to do, and the interpreter takes a second to take down what it has loaded. It must not do so under a kernel
+    # that is being compiled, which cannot be interrupted.
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
 
 
 def _run(factory: Callable[[], VliNode]) -> tuple[int, bool]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from dataclasses import dataclass, replace
 from typing import Any
@@ -138,7 +137,7 @@ def _read_exposure(message: Any) -> ExposureNote:
 
 def main() -> None:
     """Run the node."""
-    sys.exit(run_node(DemuxNode))
+    run_node(DemuxNode)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import threading
 import time
 from pathlib import Path
@@ -164,7 +163,7 @@ class DriverNode(VliNode):
 
 def main() -> None:
     """Run the node."""
-    sys.exit(run_node(DriverNode))
+    run_node(DriverNode)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass, replace
 
 from nav_msgs.msg import Odometry
@@ -118,7 +117,7 @@ class FrontEndNode(VliNode):
 
 def main() -> None:
     """Run the node."""
-    sys.exit(run_node(FrontEndNode))
+    run_node(FrontEndNode)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import threading
 import time
 from dataclasses import dataclass, replace
@@ -268,7 +267,7 @@ class MappingNode(VliNode):
 
 def main() -> None:
     """Run the node."""
-    sys.exit(run_node(MappingNode))
+    run_node(MappingNode)
 
 
 if __name__ == "__main__":
