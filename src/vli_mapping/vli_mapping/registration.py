@@ -103,17 +103,26 @@ def register(target: Surface, source: Surface, seed: int = 0) -> Registration:
 
 def refine(target: Surface, source: Surface, T_target_source: FloatArray) -> Registration:
     """Return the nearest registration by point-to-plane ICP whose gate closes from 1.5 to 0.3 mm."""
-    from scipy.spatial import KDTree
-
-    tree = KDTree(target.points)
-    T = T_target_source
+    T, tree = T_target_source, tree_of(target)
     for step in range(_ICP_STEPS):
         gate = max(_LOOSE_M * 0.85**step, _TIGHT_M)
         points, normals = transform(T, source.points), source.normals @ T[:3, :3].T
-        which, at = _pairs(tree, target, points, normals, gate)
+        which, at = pairs(tree, target, points, normals, gate)
         if len(which) < 6:
             break
         T = _step(points[which], target.points[at], target.normals[at]) @ T
+    return compare(tree, target, source, T)
+
+
+def tree_of(surface: Surface) -> KDTree:
+    """Return what finds the nearest point of a surface."""
+    from scipy.spatial import KDTree
+
+    return KDTree(surface.points)
+
+
+def compare(tree: KDTree, target: Surface, source: Surface, T: FloatArray) -> Registration:
+    """Return how a source, moved by ``T`` (4, 4), agrees with a target; ``tree`` is of the target."""
     points, normals = transform(T, source.points), source.normals @ T[:3, :3].T
     distance, nearest = _nearest(tree, points, 2 * _TIGHT_M)
     near = np.flatnonzero(np.isfinite(distance))
@@ -140,7 +149,7 @@ def _nearest(tree: KDTree, points: FloatArray, reach: float = np.inf) -> tuple[F
     return np.asarray(distance, np.float64), np.asarray(index, np.int64)
 
 
-def _pairs(tree: KDTree, target: Surface, points: FloatArray, normals: FloatArray, gate: float) -> tuple[IntArray, IntArray]:
+def pairs(tree: KDTree, target: Surface, points: FloatArray, normals: FloatArray, gate: float) -> tuple[IntArray, IntArray]:
     """Return which points have a target point within ``gate`` with a like normal, and which that is."""
     distance, nearest = _nearest(tree, points, gate)
     which = np.flatnonzero(np.isfinite(distance))

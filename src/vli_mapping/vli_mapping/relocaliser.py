@@ -17,11 +17,12 @@ from vli_common.arrays import ByteArray, FloatArray
 from vli_common.camera import CameraModel
 from vli_common.geometry import inverse, transform
 from vli_common.types import Counters
+from vli_mapping.alignment import Alignment, align_session
 from vli_mapping.features import THUMBNAIL_WIDTH, ImageFeatures, describe_image
 from vli_mapping.keyframe import MapKeyframe
 from vli_mapping.place_recognition import Evidence, PlaceIndex
 from vli_mapping.point_map import PointMap
-from vli_mapping.registration import ICP_VOXEL_M, Registration, Surface, refine, surface_of
+from vli_mapping.registration import ICP_VOXEL_M, Surface, surface_of
 from vli_mapping.scan_window import PosedScan
 
 _VIEWS = 6
@@ -37,10 +38,8 @@ _MAX_MOVE_M = 3e-3
 """By which the stripes may correct what the features say."""
 _MIN_LIKENESS, _MIN_SAMPLES = 0.4, 200
 _ROOM_M = 3e-3
-_SIGMA_FLOOR_M = 5e-5
-"""Of the map itself; on top of what the residuals say."""
-_INDEPENDENT = 25.0
-"""Points of a stripe whose errors are one error: that of the stripe's pose."""
+_SIGMA_FLOOR_M, _MAX_SIGMA_M = 5e-5, 2e-4
+"""Of the map itself, on top of what the residuals say; and beyond which an answer waits for more views."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,6 +119,8 @@ class Relocaliser:
         Args:
             scans: of the session, with poses in its frame.
         """
+        if not scans:
+            return None
         try:
             return self._located(scans)
         except _InDoubtError as doubt:
@@ -129,17 +130,19 @@ class Relocaliser:
     def _located(self, scans: Sequence[PosedScan]) -> Place:
         T, support = self._most_supported()
         found = self._aligned(scans, T)
-        if found.overlap < _MIN_OVERLAP:
+        if found.fit.overlap < _MIN_OVERLAP:
             raise _InDoubtError("off_the_map")
-        if found.agreeing < _MIN_AGREEING or self._shift(found.T_target_source, T) > _MAX_MOVE_M:
+        if found.fit.agreeing < _MIN_AGREEING or self._shift(found.T_map_session, T) > _MAX_MOVE_M:
             raise _InDoubtError("stripes_disagree")
-        if not self._is_level(found.T_target_source):
+        if found.sigma_m > _MAX_SIGMA_M:
+            raise _InDoubtError("uncertain")
+        if not self._is_level(found.T_map_session):
             raise _InDoubtError("tilted")
-        likeness = self._likeness(scans, found.T_target_source)
+        likeness = self._likeness(scans, found.T_map_session)
         if likeness < _MIN_LIKENESS:
             raise _InDoubtError("images_differ")
-        sigma = float(np.hypot(found.rms_m * np.sqrt(_INDEPENDENT / found.overlap), _SIGMA_FLOOR_M))
-        return Place(found.T_target_source, sigma, support, found.agreeing, likeness)
+        sigma = float(np.hypot(found.sigma_m, _SIGMA_FLOOR_M))
+        return Place(found.T_map_session, sigma, support, found.fit.agreeing, likeness)
 
     def _most_supported(self) -> tuple[FloatArray, int]:
         """Return the hypothesis that most features agree with, and how many.
@@ -169,15 +172,13 @@ class Relocaliser:
     def _is_level(self, T_map_session: FloatArray) -> bool:
         return not self._is_levelled or bool(T_map_session[2, 2] > np.cos(_MAX_TILT))
 
-    def _aligned(self, scans: Sequence[PosedScan], T_map_session: FloatArray) -> Registration:
-        """Return how the stripes lie on the map, near a hypothesis."""
-        if not scans:
-            return Registration(T_map_session, 0.0, 0, 0.0)
+    def _aligned(self, scans: Sequence[PosedScan], T_map_session: FloatArray) -> Alignment:
+        """Return how the session lies on the map, near a hypothesis."""
         source = _stripes(scans)
         target = _around(self._map, transform(T_map_session, source.points))
-        if not len(source.points) or not len(target.points):
-            return Registration(T_map_session, 0.0, 0, 0.0)
-        return refine(target, source, T_map_session)
+        if min(len(source.points), len(target.points)) < _MIN_OVERLAP:
+            raise _InDoubtError("off_the_map")
+        return align_session(target, source, self._evidence, self._camera.focal_px, T_map_session)
 
     def _likeness(self, scans: Sequence[PosedScan], T_map_session: FloatArray) -> float:
         """Return the median correlation of views with what the map remembers of the same spots; 0 where nothing is shared."""

@@ -18,6 +18,7 @@ WIDTH, HEIGHT, PITCH = 0.114, 0.076, 0.019
 """Metres: six by four fields of one pitch."""
 _PIXEL = 1e-4
 CAMERA = calibration().camera
+_NOISE = 2.0 * np.random.default_rng(0).normal(size=(CAMERA.height, CAMERA.width))
 
 
 def unique_print(seed: int = 1) -> ByteArray:
@@ -57,8 +58,7 @@ class Plate:
         seen = cv2.warpPerspective(self.texture, CAMERA.matrix @ plate, (CAMERA.width, CAMERA.height), flags=cv2.INTER_LINEAR)
         u, v = np.meshgrid(np.arange(CAMERA.width) - CAMERA.cx, np.arange(CAMERA.height) - CAMERA.cy)
         light = 1.0 / (1.0 + (u**2 + v**2) / CAMERA.fx**2) ** 2
-        noise = np.random.default_rng(stamp_ns % 2**32).normal(size=seen.shape) * 2.0
-        grey = np.clip(seen * light + noise, 0, 255).astype(np.uint8)
+        grey = np.clip(seen * light + np.roll(_NOISE, stamp_ns % 997), 0, 255).astype(np.uint8)
         return Image(stamp_ns, np.repeat(grey[:, :, None], 3, axis=2))
 
     def scan(self, T_map_camera: FloatArray, stamp_ns: int = 0) -> LaserScan:
@@ -72,13 +72,10 @@ class Plate:
     def point_map(self) -> PointMap:
         """Return the map of the whole plate, with its keyframes."""
         result, intake = PointMap(), KeyframeIntake(CAMERA)
-        x = np.arange(0.0, WIDTH, 2.5e-4)
-        for number, y in enumerate(np.arange(0.0, HEIGHT, 2.5e-4)):
+        x = np.arange(0.0, WIDTH - _PIXEL, 3e-4)
+        for number, y in enumerate(np.arange(0.0, HEIGHT - _PIXEL, 3e-4)):
             points = np.column_stack([x, np.full_like(x, y), np.zeros_like(x)])
-            grey = self.texture[
-                min(round(y / _PIXEL), len(self.texture) - 1),
-                np.minimum(np.rint(x / _PIXEL), self.texture.shape[1] - 1).astype(int),
-            ]
+            grey = self.texture[round(y / _PIXEL), np.rint(x / _PIXEL).astype(int)]
             normals = np.tile(np.float32([0, 0, 1]), (len(x), 1))
             colours = np.repeat(grey[:, None], 3, axis=1).astype(np.float32)
             result.insert(stripe(points, number, normals=normals, planarity=np.ones(len(x), np.float32), colours=colours))

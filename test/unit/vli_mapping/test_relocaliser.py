@@ -7,10 +7,11 @@ import pytest
 from mapping_scenes import CAMERA_HEIGHT
 from printed_plate import CAMERA, Plate, apart, labelled_print, repeating_print, turned, unique_print
 
-from vli_common.arrays import FloatArray
-from vli_common.geometry import inverse, pose, so3_exp
+from vli_common.arrays import ByteArray, FloatArray
+from vli_common.geometry import inverse, pose, so3_exp, transform
 from vli_common.types import Counters
 from vli_mapping.colour import colour_points
+from vli_mapping.map_keyframes import KeyframeIntake
 from vli_mapping.point_map import PointMap
 from vli_mapping.relocaliser import Place, Relocaliser, View
 from vli_mapping.scan_window import PosedScan
@@ -38,19 +39,23 @@ def seek(
     scans: list[PosedScan] = []
     place = None
     for index, (x, y) in enumerate(path):
+        view = turned(x, y, 0.5)
+        pixels = plate.image(view, index).pixels
         for step in range(10):
             T = turned(x + 3e-4 * step, y + 2e-4 * step, 0.5)
-            scans.append(posed(plate, T, inverse(T_map_session) @ T, 10 * index + step))
-        view = turned(x, y, 0.5)
-        relocaliser.add_view(View(index, plate.image(view, index).pixels, inverse(T_map_session) @ view))
+            scans.append(posed(plate, T, inverse(T_map_session) @ T, 10 * index + step, (pixels, view)))
+        relocaliser.add_view(View(index, pixels, inverse(T_map_session) @ view))
         place = place or relocaliser.locate(scans)
     return place, counters
 
 
-def posed(plate: Plate, T_map_camera: FloatArray, T_session_camera: FloatArray, number: int) -> PosedScan:
+def posed(
+    plate: Plate, T_map_camera: FloatArray, T_session_camera: FloatArray, number: int, view: tuple[ByteArray, FloatArray]
+) -> PosedScan:
+    """Return a scan with its pose in the session, and colours of an image that was taken where the map has it."""
     scan = plate.scan(T_map_camera, number)
     count = len(scan)
-    colours = colour_points(CAMERA, scan.points, [(plate.image(T_map_camera, number).pixels, np.eye(4))])
+    colours = colour_points(CAMERA, transform(T_map_camera, scan.points), [view])
     normals = np.tile(T_session_camera[:3, :3].T @ [0, 0, 1], (count, 1)).astype(np.float32)
     every = np.ones(count, np.bool_)
     return PosedScan(scan, number, T_session_camera, colours, every, every, normals, np.ones(count, np.float32), described=True)
@@ -103,18 +108,18 @@ def test_an_answer_that_tilts_gravity_is_none(unique: tuple[Plate, PointMap]) ->
 
 
 def test_stripes_that_do_not_lie_on_the_map_speak_against_an_answer(unique: tuple[Plate, PointMap]) -> None:
-    """A picture of the plate, three millimetres from where the plate was, with a slope: not the plate."""
+    """The picture is right, but what the laser sees is no plate."""
     plate, point_map = unique
     counters = Counters()
     relocaliser = Relocaliser(point_map, point_map.keyframes, CAMERA, True, counters)
-    scans = []
+    scans, view = [], turned(0.05, 0.04, 0.5)
+    pixels = plate.image(view).pixels
     for step in range(20):
         T = turned(0.05 + 3e-4 * step, 0.04, 0.5)
-        item = posed(plate, T, T, step)
+        item = posed(plate, T, T, step, (pixels, view))
         bumps = 1.0 + 0.02 * np.sin(item.scan.points[:, :1] / 5e-4)
         scans.append(replace(item, scan=replace(item.scan, points=item.scan.points * bumps)))
-    view = turned(0.05, 0.04, 0.5)
-    relocaliser.add_view(View(0, plate.image(view).pixels, view))
+    relocaliser.add_view(View(0, pixels, view))
     assert relocaliser.locate(scans) is None
     assert counters["relocalisation_stripes_disagree"] == 1
 
@@ -129,8 +134,6 @@ def test_views_of_the_map_know_where_their_features_are(unique: tuple[Plate, Poi
 
 
 def test_what_is_seen_again_from_the_same_place_is_not_remembered_twice(unique: tuple[Plate, PointMap]) -> None:
-    from vli_mapping.map_keyframes import KeyframeIntake
-
     plate, point_map = unique
     before = len(point_map.keyframes)
     intake = KeyframeIntake(CAMERA)
