@@ -15,26 +15,38 @@ from vli_mapping.light import Sightings
 SATURATED = 250
 """Grey level from which on a channel says only how much light there was at least."""
 _DARKEST = 8
+_HIDING_M, _HIDING_PX = 1.0e-3, 2.0
+"""A point this much nearer in the same cell of so many pixels hides another; a flank seen at 80 degrees is no deeper there."""
+_MOST_CELLS = 1 << 22
 _MIN_FACING = 0.5
 """Cosine between normal and viewing ray of a spot that tells of the light."""
 _SHARPENING = 1.0
 """Times what a 3×3 binomial takes away: demosaicing and motion blur a print about that much."""
 
 
-def colour_points(camera: CameraModel, points: FloatArray, views: Sequence[tuple[ByteArray, FloatArray]]) -> Float32Array:
+def colour_points(
+    camera: CameraModel,
+    points: FloatArray,
+    views: Sequence[tuple[ByteArray, FloatArray]],
+    beside: FloatArray | None = None,
+) -> Float32Array:
     """Return RGB (N, 3), 0 … 255, the mean over the views that show a point; NaN where none does.
 
-    A saturated sample counts only where there is no other.
+    A sample that is saturated, or where something nearer is in front of the point, counts only where there is no other.
 
     Args:
         camera: of all views.
         points: (N, 3) in some frame w, in order along a stripe.
         views: pixels (H, W, 3) BGR or (H, W) grey, and ``T_w_camera`` (4, 4), of each long image.
+        beside: (M, 3) in w, more of the surface, that may be in front of the points as they themselves may.
     """
     total, weight = np.zeros((len(points), 3), np.float32), np.zeros(len(points), np.float32)
+    surface = points if beside is None or not len(beside) else np.concatenate([points, beside])
     for pixels, T_w_camera in views:
-        where = camera.project(transform(inverse(T_w_camera), points))
-        _add_samples(pixels if pixels.ndim == 3 else pixels[:, :, None], where, total, weight)
+        local = transform(inverse(T_w_camera), surface)
+        where, hidden = camera.project(local), np.empty(len(points), np.bool_)
+        _mark_hidden(where, local, _HIDING_M, hidden)
+        _add_samples(pixels if pixels.ndim == 3 else pixels[:, :, None], where[: len(points)], hidden, total, weight)
     with np.errstate(invalid="ignore"):
         result: Float32Array = total / weight[:, None]
     return result
@@ -64,7 +76,40 @@ def sight(
 
 
 @njit(cache=True, nogil=True)
-def _add_samples(pixels, where, total, weight):  # type: ignore[no-untyped-def]
+def _mark_hidden(where, local, margin, hidden):  # type: ignore[no-untyped-def]
+    """Say which of the first N of M points have another of them in front, nearer by ``margin`` and in the same few pixels.
+
+    Args:
+        where: (M, 2) pixels.
+        local: (M, 3), camera frame.
+        margin: metres along the axis.
+        hidden: (N,), the answer.
+    """
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    for index in range(len(where)):
+        for axis in range(2):
+            # Written so that NaN is left out.
+            if where[index, axis] < low[axis]:
+                low[axis] = where[index, axis]
+            if where[index, axis] > high[axis]:
+                high[axis] = where[index, axis]
+    hidden[:] = False
+    cells = np.floor((high - low) / _HIDING_PX) + 1
+    if not (0 < cells[0] * cells[1] < _MOST_CELLS):
+        return
+    nearest = np.full((int(cells[1]), int(cells[0])), np.inf)
+    for index in range(len(where)):
+        if where[index, 0] >= low[0] and where[index, 1] >= low[1] and local[index, 2] > 0:
+            i, j = int((where[index, 1] - low[1]) / _HIDING_PX), int((where[index, 0] - low[0]) / _HIDING_PX)
+            nearest[i, j] = min(nearest[i, j], local[index, 2])
+    for index in range(len(hidden)):
+        if where[index, 0] >= low[0] and where[index, 1] >= low[1]:
+            i, j = int((where[index, 1] - low[1]) / _HIDING_PX), int((where[index, 0] - low[0]) / _HIDING_PX)
+            hidden[index] = nearest[i, j] < local[index, 2] - margin
+
+
+@njit(cache=True, nogil=True)
+def _add_samples(pixels, where, hidden, total, weight):  # type: ignore[no-untyped-def]
     """Add sharpened bilinear samples of BGR or grey (H, W, C) at pixels (N, 2) to RGB sums (N, 3); skip what lies outside."""
     height, width, channels = pixels.shape
     sample = np.empty(3)
@@ -73,7 +118,7 @@ def _add_samples(pixels, where, total, weight):  # type: ignore[no-untyped-def]
         # Written so that NaN fails.
         if not (u >= 0 and v >= 0 and u <= width - 1 and v <= height - 1):
             continue
-        share = np.float32(1.0)
+        share = np.float32(1e-3) if hidden[index] else np.float32(1.0)
         for channel in range(3):
             source = 2 - channel if channels == 3 else 0
             sample[channel] = _sharp_sample(pixels, u, v, source)

@@ -11,16 +11,21 @@ ROWS, FREE_HEAD, FREE = 0, 1, 2
 """Of the state (3,): rows in use, first of the chain of free rows among them (−1: none), and how many these are."""
 VISIT_SCANS = 15
 """Scans apart, half a second, up to which two colours of a point are averaged."""
+_BETTER = 2.0
+"""Times the light from which on a later visit replaces a colour: what is much the same does not change to and fro."""
 
 
 @njit(cache=True, nogil=True)
-def insert_stripe(heads, following, cell_m, state, columns, stripe, number, stamp_ns, limits, target):  # type: ignore[no-untyped-def]
+def insert_stripe(  # type: ignore[no-untyped-def]
+    heads, following, cell_m, state, columns, views, stripe, number, stamp_ns, limits, target
+):
     """Merge or add every point of a stripe, solid ones first; write its row, or −1, into ``target`` (N,).
 
     Args:
         heads, following, cell_m: the hash of the map.
         state: (3,), see ``ROWS``.
         columns: of ``Columns``, in its order.
+        views: (S, 3, 4), poses of the scans, this one's too.
         stripe: points, normals, colours, sigma, planarity, solid of ``Stripe``.
         number, stamp_ns: of the scan.
         limits: merge radius, cosine of the merge angle, merge colour, cap on the weight, fill radius.
@@ -39,7 +44,7 @@ def insert_stripe(heads, following, cell_m, state, columns, stripe, number, stam
                 continue
             at = _nearest_compatible(heads, following, cell_m, columns, p, stripe, index, merge_radius, limits)
             if at >= 0:
-                _merge(heads, following, cell_m, at, columns, stripe, index, number, limits[3])
+                _merge(heads, following, cell_m, at, columns, views, stripe, index, number, limits[3])
             else:
                 if wanted:
                     _drop_doubtful(heads, following, cell_m, state, columns, p, fill_radius)
@@ -166,7 +171,7 @@ def colours_agree(a, b, limit):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _merge(heads, following, cell_m, at, columns, stripe, index, number, max_weight):  # type: ignore[no-untyped-def]
+def _merge(heads, following, cell_m, at, columns, views, stripe, index, number, max_weight):  # type: ignore[no-untyped-def]
     """Average point ``index`` of a stripe into row ``at``."""
     position, normal, colour, weight, sigma = columns[:5]
     seen_by = columns[7]
@@ -185,7 +190,7 @@ def _merge(heads, following, cell_m, at, columns, stripe, index, number, max_wei
         link_one(heads, following, at, moved, cell_m)
     share = 1.0 / (weight[at] + 1.0)
     _blend_normal(normal[at], n, share)
-    _blend_colour(colour[at], c, share, seen_by, at, number)
+    _blend_colour(colour[at], c, share, seen_by, at, number, _is_better_view(views, seen_by[at], number, moved, normal[at]))
     information = old_information + new_information
     merged = weight[at] + 1.0
     if merged > max_weight:
@@ -196,14 +201,31 @@ def _merge(heads, following, cell_m, at, columns, stripe, index, number, max_wei
 
 
 @njit(cache=True, nogil=True)
-def _blend_colour(colour, c, share, seen_by, at, number):  # type: ignore[no-untyped-def]
+def _is_better_view(views, old, new, p, normal):  # type: ignore[no-untyped-def]
+    """Return True where scan ``new`` got clearly more of the light that travels with the camera from ``p`` (3,) than ``old``."""
+    return _brightness(views[new, :, 3], p, normal) > _BETTER * _brightness(views[old, :, 3], p, normal)
+
+
+@njit(cache=True, nogil=True)
+def _brightness(eye, p, normal):  # type: ignore[no-untyped-def]
+    """Return cosine over squared distance; the cosine of an unknown normal is 1."""
+    x, y, z = eye[0] - p[0], eye[1] - p[1], eye[2] - p[2]
+    squared = x * x + y * y + z * z
+    if normal[0] == 0 and normal[1] == 0 and normal[2] == 0:
+        return 1.0 / squared
+    return max(normal[0] * x + normal[1] * y + normal[2] * z, 0.0) / (squared * np.sqrt(squared))
+
+
+@njit(cache=True, nogil=True)
+def _blend_colour(colour, c, share, seen_by, at, number, is_better):  # type: ignore[no-untyped-def]
     """Turn a colour (3,), in place, towards ``c`` by ``share``, where both are of one visit; an unknown one takes the other.
 
-    The light moves with the camera: the mean of two visits is what neither saw, and no one light can be taken out of it.
+    The light moves with the camera: the mean of two visits is what neither saw, and no one light can be taken out of it. So of
+    two visits the one with the better view counts.
     """
     if np.isnan(c[0]):
         return
-    if np.isnan(colour[0]):
+    if np.isnan(colour[0]) or (is_better and number - seen_by[at] > VISIT_SCANS):
         colour[:] = c
         seen_by[at] = number
     elif number - seen_by[at] <= VISIT_SCANS:

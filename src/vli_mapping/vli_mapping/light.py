@@ -17,7 +17,7 @@ from vli_common.arrays import FloatArray, IntArray
 MIN_SPOTS = 200
 """Fewer spots say too little of the light: colours stay as seen."""
 _MAX_SPOTS = 3000
-_MIN_SHADING = 0.15
+_MIN_SHADING = 0.06
 """Of the reference: what got less light is amplified no further, it would be noise."""
 _UNKNOWN_COSINE = 0.7
 """Of a point that has no normal: between a surface that faces the light and the flank of a key."""

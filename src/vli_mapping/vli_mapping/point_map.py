@@ -34,7 +34,7 @@ class Columns:
         sigma: (N,) float32, metres, one standard deviation of the averaged position along the viewing ray.
         planarity: (N,) float32, see ``normals``.
         scan: (N,) int32, number of the scan that brought the point.
-        seen_by: (N,) int32, number of the scan whose long images gave the colour.
+        seen_by: (N,) int32, number of the scan whose long images gave the colour: of several visits that with the best view.
         entered_ns: (N,) int64, its stamp.
         solid: (N,) bool, False for a point that stays only until something better covers its place.
     """
@@ -165,6 +165,7 @@ class PointMap:
             CELL_M,
             self._state,
             (c.position, c.normal, c.colour, c.weight, c.sigma, c.planarity, c.scan, c.seen_by, c.entered_ns, c.solid),
+            self.views,
             (stripe.points, stripe.normals, stripe.colours, stripe.sigma, stripe.planarity, stripe.solid),
             stripe.number,
             stripe.stamp_ns,

@@ -230,7 +230,13 @@ class ScanWindow:
         if not near:
             self._counters.add("scans_without_image")
         points = transform(T_map_camera, scan.points)
-        return colour_points(self._camera, points, [(self._images[stamp].pixels, self._long_poses[stamp]) for stamp in near])
+        before = next(reversed(self._scans.values()), self._last_final)
+        return colour_points(
+            self._camera,
+            points,
+            [(self._images[stamp].pixels, self._long_poses[stamp]) for stamp in near],
+            None if before is None else before.points,
+        )
 
     def _describe(self) -> None:
         """Describe the scans that have just got a successor, and those that leave without one."""

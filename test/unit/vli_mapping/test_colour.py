@@ -79,3 +79,21 @@ def test_spots_are_sighted_only_where_they_face_two_views_and_are_well_exposed()
     np.testing.assert_allclose(twice.points, points[[0, 0]])
     assert len(sight(CAMERA, points, normals, [(grey, np.eye(4)), (dark, np.eye(4))]).spot) == 0
     assert len(sight(CAMERA, points, normals, []).spot) == 0
+
+
+def test_a_view_in_which_something_nearer_is_in_front_counts_only_where_there_is_no_other() -> None:
+    point, in_front = at_pixel(300, 200), at_pixel(300.4, 200.3, depth=0.025)
+    aside = np.eye(4)
+    aside[0, 3] = 2e-3
+    hidden, open_view = (np.full((480, 640, 3), 10, np.uint8), np.eye(4)), (np.full((480, 640, 3), 90, np.uint8), aside)
+    np.testing.assert_allclose(colour_points(CAMERA, point, [hidden, open_view]), [[50, 50, 50]])
+    np.testing.assert_allclose(colour_points(CAMERA, point, [hidden, open_view], in_front), [[90, 90, 90]], atol=0.2)
+    np.testing.assert_allclose(colour_points(CAMERA, point, [hidden], in_front), [[10, 10, 10]], atol=1e-3)
+
+
+def test_a_surface_does_not_hide_itself_and_points_behind_or_outside_hide_nothing() -> None:
+    flank = np.concatenate([at_pixel(300 + k, 200, depth=0.03 + 3e-4 * k) for k in range(20)])
+    view = [(ramp(), np.eye(4))]
+    alone = np.concatenate([colour_points(CAMERA, point[None], view) for point in flank])
+    odd = np.concatenate([[[0, 0, -0.03]], at_pixel(-50, 200, depth=0.01)])
+    np.testing.assert_allclose(colour_points(CAMERA, flank, view, odd), alone, atol=1e-3)

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from mapping_scenes import sheet, stripe
+from mapping_scenes import looking_down, sheet, stripe
 
 from vli_mapping.config import MapConfig
 from vli_mapping.point_map import PointMap, to_bytes
@@ -174,3 +174,13 @@ def test_the_same_stripes_give_the_same_map() -> None:
         clouds.append(point_map.cloud())
     assert clouds[0].points.tobytes() == clouds[1].points.tobytes()
     assert clouds[0].colours.tobytes() == clouds[1].colours.tobytes()
+
+
+@pytest.mark.parametrize(("height", "expected"), [(0.012, 200), (0.03, 100), (0.05, 100)])
+def test_of_two_visits_the_colour_of_the_one_with_clearly_more_light_stays(height: float, expected: int) -> None:
+    point_map = PointMap(MapConfig(merge_colour=255.0))
+    for number, value, z in ((0, 100, 0.03), (500, 200, height)):
+        colours = np.full((1, 3), value, np.float32)
+        point_map.insert(stripe(np.zeros((1, 3)), number, colours=colours, normals=UP, T_map_camera=looking_down(0.0, 0.0, z)))
+    np.testing.assert_array_equal(point_map.cloud().colours, [[expected] * 3])
+    assert point_map.columns.seen_by[0] == (500 if expected == 200 else 0)
