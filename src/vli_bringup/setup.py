@@ -20,6 +20,7 @@ setup(
         ("share/vli_bringup/launch", glob("launch/*.launch.py")),
         ("share/vli_bringup/config", glob("vli_bringup/data/config/*.yaml")),
         ("share/vli_bringup/rviz", glob("vli_bringup/data/config/rviz/*")),
+        ("share/vli_bringup/foxglove", glob("vli_bringup/data/config/foxglove/*")),
     ],
     install_requires=[
         "vli_common==0.1.0",
