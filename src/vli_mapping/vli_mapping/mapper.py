@@ -21,6 +21,8 @@ from vli_mapping.scan_window import PosedScan, ScanWindow
 from vli_mapping.snapshot import Snapshot, restore
 from vli_mapping.whereabouts import Whereabouts
 
+_LONG_AGO_NS = -(1 << 62)
+"""Stamp of what an earlier session brought: it is independent of every window, whatever the clocks say."""
 _REFINE_DELAY = 3
 """Scans that enter after one before its normals are fitted again: by then the surface around it is there."""
 
@@ -132,7 +134,7 @@ class Mapper:
         Poses of now and of then share no frame: until the session is found in that map, no scan enters or is related to it.
         """
         self._replace(snapshot)
-        self.map.columns.entered_ns[: self.map.rows] = 0
+        self.map.columns.entered_ns[: self.map.rows] = _LONG_AGO_NS
         self._whereabouts.begin_search()
 
     def resume(self, snapshot: Snapshot) -> None:

@@ -58,7 +58,7 @@ class Whereabouts:
             self._placement = window.placement
             if self._answer is not None and window.located:
                 released = self._moved(self._answer)
-                self._counters.add("relocalisations")
+                self._counters.add("relocalisations_heeded")
             self.drop_held()
             self._relocaliser, self._answer = None, None
         self.is_known = window.located and window.placement >= self._first_in_map
