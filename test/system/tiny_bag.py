@@ -13,6 +13,8 @@ import yaml
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
+from vli_driver.bag import BagTopics
+
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 NS = 1_000_000_000
 START_NS = 1_700_000_000 * NS
@@ -83,9 +85,18 @@ class TinyBag:
     broken_first: int = 0
     others: dict[str, str] = field(default_factory=dict)
 
+    @staticmethod
+    def topics_without_imu() -> BagTopics:
+        """Return what a reader asks of a bag that need not have an IMU."""
+        return BagTopics(imu_required=False)
+
+    def messages(self) -> list[tuple[str, int, Any]]:
+        """Return topic, log time in ns and message of all that :meth:`write` writes, in log order."""
+        return sorted([*self._images(), *self._imu(), *self._strings()], key=lambda message: message[1])
+
     def write(self, path: Path) -> Path:
         """Write a rosbag2 directory with one mcap file; return it."""
-        messages = sorted([*self._images(), *self._imu(), *self._strings()], key=lambda message: message[1])
+        messages = self.messages()
         with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
             connections: dict[str, Any] = {}
             for topic, log_ns, message in messages:

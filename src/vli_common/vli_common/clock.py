@@ -5,7 +5,8 @@ from __future__ import annotations
 from vli_common.types import NANOSECONDS
 
 _BACK_NS = NANOSECONDS
-_AHEAD_NS = 10 * NANOSECONDS
+AHEAD_NS = 10 * NANOSECONDS
+"""Within a session, no two frames in a row are farther apart."""
 
 
 class ClockMonitor:
@@ -18,7 +19,7 @@ class ClockMonitor:
         """Take the stamp of the newest item of a stream; return what happened where it means a new session, in words."""
         newest_ns = self._newest_ns.get(stream, stamp_ns)
         step_ns = stamp_ns - newest_ns
-        if -_BACK_NS <= step_ns <= _AHEAD_NS:
+        if -_BACK_NS <= step_ns <= AHEAD_NS:
             self._newest_ns[stream] = max(newest_ns, stamp_ns)
             return None
         # The other streams follow; their jump is the same one.

@@ -6,10 +6,12 @@ it, as it does offline: however late the front end is, no scan reaches the back 
 
 from __future__ import annotations
 
+import bisect
 from collections import deque
 from dataclasses import dataclass
 from typing import TypeAlias
 
+from vli_common.clock import AHEAD_NS
 from vli_common.types import Counters, FrontEndOutput, LaserScan, Preintegration, Tracks
 
 _MAX_FRAMES = 60
@@ -27,12 +29,18 @@ class NoPreintegration:
 Item: TypeAlias = LaserScan | FrontEndOutput
 
 
+def _stamp(item: LaserScan | Preintegration | NoPreintegration) -> int:
+    return item.stamp_ns
+
+
 class FramePairing:
     """Joins :class:`Tracks`, :class:`Preintegration` and :class:`LaserScan`, in order of their stamps.
 
-    Counters: ``tracks_without_preintegration`` (a newer one came, or too many frames wait: the frame goes on without),
-    ``preintegration_without_tracks``, ``scans_late`` (older than a frame that has gone: they go at once), ``scans_without_frame``
-    (too many wait: the oldest are dropped).
+    A frame that is not younger than the last one, or too much so for one session, is dropped: no front end sends it.
+
+    Counters: ``tracks_out_of_order``, ``tracks_without_preintegration`` (a newer one came, or too many frames wait: the frame
+    goes on without), ``preintegration_without_tracks``, ``scans_late`` (older than a frame that has gone: they go at once),
+    ``scans_without_frame`` (too many wait: the oldest are dropped).
     """
 
     def __init__(self) -> None:
@@ -48,12 +56,16 @@ class FramePairing:
 
     def add_tracks(self, tracks: Tracks) -> list[Item]:
         """Take the tracks of one frame; return what can go now, in order."""
+        newest_ns = self._tracks[-1].stamp_ns if self._tracks else self._newest_ns
+        if newest_ns >= 0 and not 0 < tracks.stamp_ns - newest_ns <= AHEAD_NS:
+            self.counters.add("tracks_out_of_order")
+            return []
         self._tracks.append(tracks)
         return self._release()
 
     def add_preintegration(self, preintegration: Preintegration | NoPreintegration) -> list[Item]:
         """Take the preintegration of one frame; return what can go now, in order."""
-        self._inertial.append(preintegration)
+        bisect.insort(self._inertial, preintegration, key=_stamp)
         if len(self._inertial) > _MAX_FRAMES:
             self._inertial.popleft()
             self.counters.add("preintegration_without_tracks")
@@ -64,7 +76,7 @@ class FramePairing:
         if scan.stamp_ns < self._newest_ns:
             self.counters.add("scans_late")
             return [scan]
-        self._scans.append(scan)
+        bisect.insort(self._scans, scan, key=_stamp)
         if len(self._scans) > _MAX_SCANS:
             self._scans.popleft()
             self.counters.add("scans_without_frame")

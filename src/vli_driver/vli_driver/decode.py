@@ -48,8 +48,9 @@ def decode(image: EncodedImage, route: Route = "native") -> Image:
     try:
         pixels = _decode_compressed(image, route) if image.compressed else _decode_raw(image)
     except (cv2.error, MemoryError) as error:
+        why = " ".join(str(error).split())[:200]
         raise InputError(
-            f"image of encoding '{image.encoding[:40]}', {len(image.data)} bytes, cannot be decoded: {error}"
+            f"image of encoding '{image.encoding[:40]}', {len(image.data)} bytes, cannot be decoded: {why}"
         ) from error
     if route == "grey" and pixels.ndim == 3:
         pixels = cast(ByteArray, cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY))

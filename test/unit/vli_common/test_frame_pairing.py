@@ -103,3 +103,27 @@ def test_any_interleaving_of_the_topics_gives_the_order_of_the_stamps(arrivals: 
     stamps = [item.tracks.stamp_ns if isinstance(item, FrontEndOutput) else item.stamp_ns for item in released]
     assert stamps == [0, 5, 10, 15, 20, 25, 30, 35, 40]
     assert all(item.preintegration is not None for item in released if isinstance(item, FrontEndOutput))
+
+
+def test_a_frame_that_no_front_end_sends_is_dropped() -> None:
+    pairing = FramePairing()
+    for stamp, expected in ((10, 1), (10, 0), (9, 0), (10 + 11 * 10**9, 0), (20, 1)):
+        pairing.add_preintegration(inertial(stamp))
+        assert len(pairing.add_tracks(tracks(stamp))) == expected
+    assert pairing.counters["tracks_out_of_order"] == 3
+
+
+def test_what_is_stamped_far_ahead_holds_nothing_up() -> None:
+    pairing = FramePairing()
+    pairing.add_scan(LaserScan.empty(10**18))
+    pairing.add_preintegration(inertial(10**18))
+    pairing.add_scan(LaserScan.empty(5))
+    pairing.add_preintegration(inertial(10))
+    assert names(pairing.add_tracks(tracks(10))) == ["scan 5", "frame 10"]
+
+
+def test_preintegrations_without_tracks_are_bounded() -> None:
+    pairing = FramePairing()
+    for stamp in range(1000):
+        pairing.add_preintegration(inertial(stamp))
+    assert pairing.counters["preintegration_without_tracks"] == 940

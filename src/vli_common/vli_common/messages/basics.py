@@ -12,6 +12,7 @@ from sensor_msgs.msg import CompressedImage
 from sensor_msgs.msg import Image as ImageMessage
 from std_msgs.msg import Header
 
+from vli_common.camera import CameraModel
 from vli_common.errors import MessageError
 from vli_common.messages.pointcloud import byte_array
 from vli_common.status import Health, NodeState, StageStatus
@@ -73,17 +74,24 @@ def image_to_message(image: Image) -> ImageMessage:
     )
 
 
-def image_from_message(message: ImageMessage, session: int = 0) -> Image:
+def image_from_message(message: ImageMessage, session: int = 0, camera: CameraModel | None = None) -> Image:
     """Return the image of ``image_long`` or ``image_short``; its pixels are a view of the message's data.
 
+    Args:
+        message: from a topic, not to be trusted.
+        session: that the node is in.
+        camera: that the image must be of the size of, where it is known.
+
     Raises:
-        MessageError: another encoding, or sizes that do not fit the data.
+        MessageError: another encoding, or sizes that do not fit the data, or the camera.
     """
     channels = _CHANNELS.get(message.encoding)
     if channels is None:
-        raise MessageError(f"image has encoding '{message.encoding}', expected {' or '.join(_CHANNELS)}")
+        raise MessageError(f"image has encoding '{message.encoding[:40]}', expected {' or '.join(_CHANNELS)}")
     width, height, step = message.width, message.height, message.step
     _check_image_size(message, channels)
+    if camera is not None and (width, height) != (camera.width, camera.height):
+        raise MessageError(f"image is '{width} x {height}', expected {camera.width} x {camera.height} as the calibration says")
     rows = np.frombuffer(message.data, np.uint8).reshape(height, step)[:, : width * channels]
     pixels = rows.reshape(height, width, channels) if channels > 1 else rows
     return Image(from_time(message.header.stamp), pixels, session)
@@ -134,13 +142,13 @@ def exposure_from_message(message: DiagnosticArray) -> tuple[int, float | None, 
     values = {pair.key: pair.value for pair in message.status[0].values}
     laser = values.get("laser")
     if laser not in (None, "on", "off"):
-        raise MessageError(f"exposure has laser '{laser}', expected on or off")
+        raise MessageError(f"exposure has laser '{laser[:40]}', expected on or off")
     try:
         exposure_s = float(values["exposure_s"]) if "exposure_s" in values else None
     except ValueError:
         exposure_s = -1.0
     if exposure_s is not None and not 0 < exposure_s < math.inf:
-        raise MessageError(f"exposure has exposure_s '{values['exposure_s']}', expected seconds above 0")
+        raise MessageError(f"exposure has exposure_s '{values['exposure_s'][:40]}', expected seconds above 0")
     return from_time(message.header.stamp), exposure_s, None if laser is None else laser == "on"
 
 
@@ -193,6 +201,6 @@ def status_from_message(message: DiagnosticArray) -> StageStatus:
     try:
         health, state = Health(item.level[0]), NodeState(values.pop("state", ""))
     except ValueError as error:
-        raise MessageError(f"status of '{item.name}': {error}") from error
+        raise MessageError(f"status of '{item.name[:40]}': {str(error)[:80]}") from error
     hint = "" if item.message == state.value else item.message
     return StageStatus(from_time(message.header.stamp), item.name, health, state, hint, values)

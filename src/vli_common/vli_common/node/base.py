@@ -42,6 +42,8 @@ _QUEUE_DEPTHS = 12
 _WAITING_HINT = "waiting for a calibration: give 'calibration_file' to the driver node or to this one"
 _ASIDE_S = 1.0
 """A service under way gets this long to end when the node is stopped."""
+_MOST_OTHERS = 64
+"""Nodes that are kept in mind; a name costs a sender nothing."""
 _STOP_S = 2.0
 _CALL_S = 10.0
 _DIGITS = 20
@@ -487,6 +489,9 @@ class VliNode(ManagedNode):
             self.counters.add("status_malformed")
             return
         previous = self.others.get(status.node)
+        if previous is None and len(self.others) >= _MOST_OTHERS:
+            self.counters.add("status_of_too_many_nodes")
+            return
         self.others[status.node] = status
         if previous is not None and 0 < _number(previous, "started_ns") < _number(status, "started_ns"):
             self._finished_sources.pop(status.node, None)

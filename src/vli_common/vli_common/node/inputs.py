@@ -106,8 +106,9 @@ class Input:
         (source,) = self.topic.sources
         if source not in finished:
             return False
-        sent = int(finished[source].get(f"sent.{self.topic.name}", "0"))
-        return self.received == sent or time.monotonic() - self.last_s > _QUIET_S
+        # As text: what a status says need not be a number.
+        sent = finished[source].get(f"sent.{self.topic.name}", "0")
+        return str(self.received) == sent or time.monotonic() - self.last_s > _QUIET_S
 
     def figures(self, waiting: int) -> dict[str, str]:
         """Return what the status says of it; ``waiting`` messages are in the worker's queue."""

@@ -114,11 +114,20 @@ class DemuxNode(VliNode):
     def _sort(self, item: EncodedImage) -> None:
         try:
             image = replace(decode(item), session=self.session)
+            self._check_size(image)
         except InputError as error:
             self.counters.add("undecodable_images")
             self.get_logger().warning(str(error), throttle_duration_sec=5.0)
             return
         self._emit(self._demultiplexer.push(image))
+
+    def _check_size(self, image: Image) -> None:
+        camera, (height, width) = self.existing(self.calibration).camera, image.pixels.shape[:2]
+        if (width, height) != (camera.width, camera.height):
+            raise InputError(
+                f"image is '{width} x {height}', the calibration is for {camera.width} x {camera.height}; "
+                "use the calibration of this camera and resolution"
+            )
 
     def _emit(self, frames: list[tuple[Exposure, Image]]) -> None:
         for exposure, image in frames:

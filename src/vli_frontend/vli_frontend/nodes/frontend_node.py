@@ -5,9 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 from nav_msgs.msg import Odometry
+from sensor_msgs.msg import Image as ImageMessage
+from sensor_msgs.msg import PointCloud2
 
 from vli_common.calibration import Calibration
 from vli_common.config import parameter
+from vli_common.errors import MessageError
 from vli_common.messages import (
     Session,
     bias_from_message,
@@ -51,7 +54,7 @@ class FrontEndNode(VliNode):
         uses_imu = self.mode.uses_imu
         self.receive(IMU, imu_from_message, self._on_imu, self.parameters.config(InputTopics).imu_topic, uses_imu, uses_imu)
         self.receive(LASER_POINTS, scan_from_message, self._on_scan)
-        self.receive(IMAGE_LONG, lambda message: image_from_message(message, self.session), self._on_image, sheds=1)
+        self.receive(IMAGE_LONG, self._read_image, self._on_image, sheds=1)
         self.receive(BIAS, lambda message: bias_from_message(message, self.session), self._on_bias, ends=False)
         self.receive(ODOMETRY, self._to_pose, self._on_pose, ends=False)
 
@@ -90,6 +93,9 @@ class FrontEndNode(VliNode):
     def _on_imu(self, sample: ImuSample) -> None:
         self._emit(self.front_end.add_imu(sample))
 
+    def _read_image(self, message: ImageMessage) -> Image:
+        return image_from_message(message, self.session, self.existing(self.calibration).camera)
+
     def _on_image(self, image: Image) -> None:
         self._emit(self.front_end.add_image(image))
 
@@ -107,12 +113,19 @@ class FrontEndNode(VliNode):
 
     def _emit(self, frames: list[FrontEndOutput]) -> None:
         for frame in frames:
-            tracks, inertial = frame.tracks, frame.preintegration
-            message = (
-                preintegration_to_message(inertial) if inertial else no_preintegration_message(tracks.stamp_ns, tracks.session)
-            )
-            self.send(PREINTEGRATION, message)
-            self.send(TRACKS, tracks_to_message(tracks))
+            self.send(PREINTEGRATION, self._inertial_message(frame))
+            self.send(TRACKS, tracks_to_message(frame.tracks))
+
+    def _inertial_message(self, frame: FrontEndOutput) -> PointCloud2:
+        """Return the preintegration, or the note that there is none: samples beyond all measure lead to one nobody would take."""
+        tracks, inertial = frame.tracks, frame.preintegration
+        if inertial is not None:
+            try:
+                return preintegration_to_message(inertial)
+            except MessageError as error:
+                self.counters.add("preintegrations_unsound")
+                self.get_logger().warning(f"the IMU is left out: {error}", throttle_duration_sec=5.0)
+        return no_preintegration_message(tracks.stamp_ns, tracks.session)
 
 
 def main() -> None:

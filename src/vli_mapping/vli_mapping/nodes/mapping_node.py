@@ -121,7 +121,7 @@ class MappingNode(VliNode):
         return self.existing(self._mapper)
 
     def _read_image(self, message: ImageMessage) -> Image:
-        return image_from_message(message, self.session)
+        return image_from_message(message, self.session, self.existing(self.calibration).camera)
 
     def _on_image(self, image: Image) -> None:
         self.mapper.add_image(image)
