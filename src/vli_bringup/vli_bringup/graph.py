@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from vli_common.topics import DIAGNOSTICS, NAMESPACE, TOPICS
 from vli_common.types import Mode
 from vli_driver.config import DriverConfig
 
@@ -104,3 +105,21 @@ def describe_graph(
         }
     nodes = [NodeDescription("vli_driver", SCANNER, source, respawn=playback is None)]
     return nodes + [NodeDescription(package, name, {**shared, **own.get(name, {})}) for package, name in STAGES]
+
+
+def remappings(namespace: str) -> list[tuple[str, str]]:
+    """Return name → name for every node of one scanner among several: what is absolute becomes its own.
+
+    Args:
+        namespace: of the nodes; nothing is renamed in the default one.
+    """
+    absolute = [topic.name for topic in TOPICS if topic.name.startswith("/") and topic is not DIAGNOSTICS]
+    return [] if namespace == NAMESPACE else [(name, name.removeprefix("/")) for name in absolute]
+
+
+def viewer_remappings(namespace: str) -> list[tuple[str, str]]:
+    """Return the same for a viewer that knows the topics by the names of the default namespace."""
+    if namespace == NAMESPACE:
+        return []
+    relative = [topic.name for topic in TOPICS if not topic.name.startswith("/")]
+    return [*remappings(namespace), *((f"/{NAMESPACE}/{name}", name) for name in relative)]
