@@ -9,6 +9,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 
+_LONGEST = 400
+
+
 class VliError(Exception):
     """Base of every error that the project raises on purpose."""
 
@@ -44,7 +47,15 @@ class InputError(VliError):
 
 
 class MessageError(VliError):
-    """A message from a topic is malformed; the receiver drops and counts it."""
+    """A message from a topic is malformed; the receiver drops and counts it.
+
+    Args:
+        text: may quote the message; control characters and whatever is too long for a log are left out.
+    """
+
+    def __init__(self, text: str) -> None:
+        shown = "".join(character if character.isprintable() else " " for character in text[:_LONGEST])
+        super().__init__(shown + ("…" if len(text) > _LONGEST else ""))
 
 
 class OutputError(VliError):
