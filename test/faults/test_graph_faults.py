@@ -27,6 +27,7 @@ from vli_common.calibration import load_calibration
 from vli_common.messages import cloud_from_message
 from vli_common.node.transport import message_type, quality
 from vli_common.topics import MAP
+from vli_mapping.map_file import load_map
 
 pytestmark = pytest.mark.graph
 
@@ -99,10 +100,10 @@ def test_a_mapping_node_started_again_goes_on_with_the_map_it_had_saved(
         wait(listener, lambda: listener.value(_MAPPING, "points") > 5000 and saved.exists(), processes=processes)
         session = listener.value(_MAPPING, "session")
         killed_ns = kill(processes, _MAPPING)
+        reloaded = len(load_map(saved))
         wait(listener, lambda: is_back(listener, _MAPPING, killed_ns), processes=processes)
-        wait(listener, lambda: listener.value(_MAPPING, "points") > 5000, 10.0, processes)
-        reloaded = listener.value(_MAPPING, "points")
-        wait(listener, lambda: listener.value(_MAPPING, "points") > reloaded + 1000, 60.0, processes)
+        wait(listener, lambda: listener.value(_MAPPING, "points") >= reloaded, 20.0, processes)
+        wait(listener, lambda: listener.value(_MAPPING, "points") > reloaded + 500, 60.0, processes)
         assert listener.value(_MAPPING, "session") == session
 
 
