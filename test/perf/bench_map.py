@@ -1,4 +1,4 @@
-"""Figures of the map alone: accuracy with true poses, and time against the size of the map.
+"""Figures of the map alone: accuracy with true poses, and time, memory and the locks of a save against the size of the map.
 
 Run from the root of the workspace::
 
@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,8 +28,10 @@ from vli_driver.config import DemuxConfig, StripeConfig
 from vli_driver.decode import decode
 from vli_driver.demux import Demultiplexer
 from vli_driver.scanner import StripeScanner
+from vli_mapping.contradiction import contradict
 from vli_mapping.mapper import Mapper
 from vli_mapping.point_map import PointMap, Stripe
+from vli_mapping.snapshot import take
 from vli_mapping.warm_up import warm_up
 
 DATA = Path(__file__).resolve().parents[3] / "shared/data/keyboard_short"
@@ -146,7 +149,7 @@ def print_accuracy(mapper: Mapper, data: Path) -> None:
     cloud = mapper.map.cloud(light=mapper.light(), as_seen=True)
     surface = surface_figures(surface_distances(cloud.points.astype(np.float64), read_surface(data / "surface.ply")))
     seen = read_cloud(data / "seen.ply")
-    covered, nearest = nearest_map_points(seen.points, cloud.points)
+    covered, nearest = nearest_map_points(seen.points.astype(np.float64), cloud.points.astype(np.float64))
     complete = completeness_figures(covered, (seen.colours[covered], cloud.colours[nearest[covered]]))
     with_normal = 0.0 if cloud.normals is None else 100 * cloud.normals.any(axis=1).mean()
     print(
@@ -170,13 +173,31 @@ def print_scaling(sizes: list[float]) -> None:
         for number, row in enumerate(rng.integers(0, rows, 300).tolist()):
             stripe = sheet_stripe(row, POINTS, int(rng.integers(0, SHEET - POINTS)), rows + number, rng)
             start = time.perf_counter()
-            target = point_map.insert(stripe)
-            point_map.refine_normals(np.unique(target), stripe.viewpoint)
+            trusted, _ = contradict(point_map, stripe)
+            target = point_map.insert(trusted)
+            point_map.refine_normals(np.unique(target[target >= 0]), stripe.viewpoint)
             spent.append(1e3 * (time.perf_counter() - start))
+        resident = resident_mb()
+        locks = save_locks(point_map)
         print(
             f"{len(point_map) / 1e6:.2f} million points: {np.median(spent):.3f} ms a stripe of {POINTS} (median), "
-            f"{np.percentile(spent, 95):.3f} p95, {resident_mb():.0f} MB resident"
+            f"{np.percentile(spent, 95):.3f} p95, {resident:.0f} MB resident; a save locks the map {len(locks)} times, "
+            f"{np.median(locks):.2f} ms (median), {max(locks):.2f} at most"
         )
+
+
+def save_locks(point_map: PointMap) -> list[float]:
+    """Return how long, in milliseconds, each step of a copy of the map keeps others out."""
+    spent = []
+
+    def exclusively(step: Callable[[], Any]) -> Any:
+        start = time.perf_counter()
+        result = step()
+        spent.append(1e3 * (time.perf_counter() - start))
+        return result
+
+    take(point_map, None, exclusively)
+    return spent
 
 
 def sheet_stripe(row: int, count: int, start: int, number: int, rng: np.random.Generator) -> Stripe:

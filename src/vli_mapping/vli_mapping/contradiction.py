@@ -17,7 +17,7 @@ from numba import njit
 from vli_mapping.point_map import PointMap, Stripe
 from vli_mapping.spatial_hash import bucket_of, cell_of, same_cell
 
-_STRIDE = 2
+_STRIDE = 3
 """Of the stripe's points: their rays are closer than the radius about them all the same."""
 _REACH_M = 0.012
 """How far in front of the stripe, and behind it, points are looked for: the height of what a scanner this near looks into."""
