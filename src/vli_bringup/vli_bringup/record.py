@@ -15,6 +15,7 @@ from vli_bringup.recording.bag_writer import BagWriter
 from vli_bringup.recording.directory import RecordingDirectory
 from vli_bringup.recording.listener import RecordingListener, graph_topics, scanner_topics
 from vli_bringup.recording.topic import RecordedTopic
+from vli_bringup.recording.transforms import TransformMaker, are_published
 from vli_bringup.recording.writer_thread import WriterThread
 from vli_bringup.stopping import stop_on_signals
 from vli_common.errors import InputError, OutputError, VliError
@@ -44,9 +45,10 @@ def run(args: argparse.Namespace) -> int:
     topics = scanner_topics(chosen_topics(args)) + (graph_topics() if args.all else [])
     with RecordingDirectory(args.out, args.overwrite) as directory:
         writer = WriterThread(BagWriter(directory, args.out.name))
-        with stop_on_signals() as stop, RecordingListener(topics, writer.put) as listener:
+        maker = TransformMaker(writer.put) if args.all and not are_published() else None
+        with stop_on_signals() as stop, RecordingListener(topics, maker.put if maker else writer.put) as listener:
             _record(listener, writer, stop, args.duration)
-            recorded = listener.recorded
+            recorded = listener.recorded + (maker.recorded if maker else [])
         failure = writer.close()
         count = _messages_in(directory)
         if not count:
