@@ -26,7 +26,7 @@ from vli_common.arrays import FloatArray
 from vli_common.calibration import Calibration, load_calibration
 from vli_common.node.transport import message_type, quality
 from vli_common.status import NodeState
-from vli_common.topics import IMAGE_RAW_COMPRESSED, POSE, Topic
+from vli_common.topics import IMAGE_RAW, IMAGE_RAW_COMPRESSED, POSE, Topic
 from vli_common.types import NANOSECONDS, EncodedImage, Mode
 from vli_driver.bag import BagReader, BagTopics
 from vli_driver.decode import decode
@@ -71,8 +71,9 @@ class Meter:
     def __init__(self, listener: GraphListener) -> None:
         self.published_s: dict[int, float] = {}
         self.posed_s: dict[int, float] = {}
-        for topic, times in ((IMAGE_RAW_COMPRESSED, self.published_s), (POSE, self.posed_s)):
-            self._subscribe(listener, topic, times)
+        for topic in (IMAGE_RAW, IMAGE_RAW_COMPRESSED):
+            self._subscribe(listener, topic, self.published_s)
+        self._subscribe(listener, POSE, self.posed_s)
 
     def latencies_ms(self, since_s: float = 0.0) -> FloatArray:
         """Return the time (N,) from image to pose of every frame posed since, in order."""
