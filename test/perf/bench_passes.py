@@ -1,6 +1,6 @@
 """How well passes over the same spot agree: points of one pass against planes through those of the pass before it.
 
-    python test/perf/bench_passes.py RECORDING [RUN ...]
+    python test/perf/bench_passes.py [RECORDING [RUN ...]]
 
 RECORDING has ``bag``, ``calibration.yaml``, ``truth.tum`` and ``passes.json``, as ``vli simulate`` writes them; a RUN is what
 ``vli run`` made of it. Scans are as detected, with the poses of each run, and with the true ones: what is then left is the
@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from bench_map import read_frames
+from bench_map import DATA, read_frames
 from scipy.interpolate import CubicSpline
 from scipy.spatial import KDTree
 
@@ -73,7 +73,7 @@ def disagreement(scans: Sequence[LaserScan], poses: dict[int, FloatArray], passe
 def main() -> None:
     """Print one line for the true poses, and one a run."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("recording", type=Path)
+    parser.add_argument("recording", type=Path, nargs="?", default=DATA)
     parser.add_argument("runs", type=Path, nargs="*")
     args = parser.parse_args()
     calibration = load_calibration(args.recording / "calibration.yaml")

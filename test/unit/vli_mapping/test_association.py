@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from mapping_scenes import FRAME_NS, SIGMA, looking_down, scan_of, step_height, stripe
 
+from vli_common.arrays import FloatArray
+from vli_common.geometry import so3_exp
 from vli_common.types import NANOSECONDS, Counters, MapConstraints
 from vli_mapping.association import associate
 from vli_mapping.config import AssociationConfig
@@ -189,3 +191,58 @@ def test_the_shift_of_a_whole_window_comes_out_of_its_constraints(stepped: Point
     root = np.sqrt(constraints.weight) / constraints.sigma
     solved = np.linalg.lstsq((constraints.normals_map * root[:, None])[:, 1:], residual * root, rcond=None)[0]
     np.testing.assert_allclose(solved, -shift[1:], atol=1.5e-5)
+
+
+RADIUS, AXIS_HEIGHT = 0.02, -0.02
+
+
+def on_bar(x: FloatArray, angle: FloatArray) -> FloatArray:
+    """Return points (N, 3) of a bar along x whose top is the x axis, ``angle`` from its top."""
+    return np.stack([x, RADIUS * np.sin(angle), RADIUS * np.cos(angle) + AXIS_HEIGHT], axis=1)
+
+
+def turned(angle: float) -> FloatArray:
+    """Return the motion (4, 4) around the axis of the bar."""
+    T = np.eye(4)
+    T[:3, :3] = so3_exp(np.array([angle, 0.0, 0.0]))
+    T[:3, 3] = [0.0, 0.0, AXIS_HEIGHT] - T[:3, :3] @ [0.0, 0.0, AXIS_HEIGHT]
+    return T
+
+
+def moved(along: float) -> FloatArray:
+    """Return the motion (4, 4) along the axis of the bar."""
+    T = np.eye(4)
+    T[0, 3] = along
+    return T
+
+
+def test_a_bar_constrains_neither_the_way_along_its_axis_nor_the_turn_around_it() -> None:
+    bar = PointMap()
+    rng = np.random.default_rng(0)
+    angle = np.arange(-0.6, 0.6, 5e-3)
+    for number, x in enumerate(np.arange(-0.006, 0.006, 2.5e-4)):
+        points = on_bar(np.full_like(angle, x), angle)
+        bar.insert(stripe(points + rng.normal(size=points.shape) * 1e-5, number))
+    bar.refine_normals(bar.alive(), np.array([0, 0, 1.0]))
+    points = on_bar(np.zeros(80), np.linspace(-0.4, 0.4, 80))
+    local = (points - looking_down(0.0, 0.0)[:3, 3]) @ looking_down(0.0, 0.0)[:3, :3]
+    free, stiff = [], []
+    for believed, seen in ((moved(3e-4), free), (turned(0.015), free), (np.eye(4), free)):
+        item = posed(0.003)
+        item.T_map_camera = believed @ looking_down(0.0, 0.0)
+        item.scan = replace(item.scan, points=local, sigma=np.full(80, SIGMA))
+        for name, shape in (("colours", (80, 3)), ("normals", (80, 3)), ("planarity", 80), ("solid", 80)):
+            setattr(item, name, np.full(shape, {"colours": 100, "solid": 1}.get(name, 0), getattr(item, name).dtype))
+        constraints, _ = found(bar, item)
+        assert constraints is not None
+        seen.append(np.sqrt(np.mean(residuals(constraints, item) ** 2)))
+        # Rows of the Jacobian of the point-to-plane distance by a motion of the scan, about the axis of the bar.
+        arm = constraints.points_map - [0.0, 0.0, AXIS_HEIGHT]
+        rows = np.concatenate([constraints.normals_map, np.cross(arm, constraints.normals_map) / RADIUS], axis=1)
+        stiff.append(np.sqrt((rows**2).mean(axis=0)))
+    assert max(free) < 2e-5
+    for sensitivity in stiff:
+        assert sensitivity[0] < 0.03
+        assert sensitivity[3] < 0.03
+        assert sensitivity[2] > 0.8
+        assert sensitivity[1] > 0.15
