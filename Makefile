@@ -94,6 +94,7 @@ bench-scenes: venv
 
 config: venv
 	$(BIN)/python -m vli_bringup.settings > config/vli.yaml
+	$(BIN)/python -m vli_bringup.access > config/sros2/vli.policy.xml
 
 lock:
 	$(PYTHON) .ci/lock.py
