@@ -43,6 +43,7 @@ _NO_LASER_NS, _NO_IMU_NS = 2 * NANOSECONDS, NANOSECONDS // 2
 """A sensor that says nothing for so long is missed."""
 _NO_IMAGE = (NANOSECONDS // 4, 8)
 """ns and frame periods: a pose across a gap between images that is longer than both is DEGRADED."""
+_SOLVER_ERRORS = (SmootherError, np.linalg.LinAlgError)
 _RECOVERY_NS = NANOSECONDS
 """A solver that fails twice within this has lost the window."""
 _RESTART_VELOCITY = 0.02
@@ -144,7 +145,7 @@ class BackEnd:
             if self._estimator is None:
                 return self._start(frame)
             return self._track(frame, self._estimator)
-        except SmootherError as error:
+        except _SOLVER_ERRORS as error:
             self.counters.add("solver_failures")
             return self._recover(stamp, str(error))
 
@@ -239,7 +240,8 @@ class BackEnd:
         depths = DepthPrior.of_scene(self._calibration, config)
         try:
             self._estimator = WindowEstimator(self._calibration, config, tracks, state, prior, estimator.scans, depths)
-        except SmootherError as error:
+            self._estimator.adopt(estimator.landmarks)
+        except _SOLVER_ERRORS as error:
             return self._lose(stamp_ns, f"solver failed: {error}")
         self.counters.add("windows_renewed")
         self.state, self.reason = TrackingState.DEGRADED, f"solver failed, the window begins anew: {problem}"

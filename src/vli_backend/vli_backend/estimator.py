@@ -12,7 +12,7 @@ from vli_backend.condense import Quadratic, condense, refine
 from vli_backend.config import BackEndConfig
 from vli_backend.depth_prior import DepthPrior
 from vli_backend.frame_pose import FramePose, solve_frame_pose
-from vli_backend.landmarks import LandmarkTable
+from vli_backend.landmarks import LandmarkPoints, LandmarkTable
 from vli_backend.laser_depth import measure_slot
 from vli_backend.map_residuals import condense_map
 from vli_backend.plane_residuals import PlaneResiduals, plane_residuals
@@ -22,7 +22,7 @@ from vli_backend.smoother import Condenser, GtsamSmoother, KeyframeState, Smooth
 from vli_backend.window import FrameRecord, Window, close_interval
 from vli_common.arrays import BoolArray, FloatArray
 from vli_common.calibration import Calibration
-from vli_common.geometry import inverse
+from vli_common.geometry import inverse, transform
 from vli_common.types import (
     FrontEndOutput,
     ImuBias,
@@ -34,6 +34,9 @@ from vli_common.types import (
     Tracks,
     WindowPoses,
 )
+
+_ADOPTED_SIGMA = 0.005
+"""Least relative sigma of a depth that comes from the window before."""
 
 
 @dataclass(frozen=True)
@@ -115,6 +118,27 @@ class WindowEstimator:
     def scans(self) -> list[LaserScan]:
         """Stripes since the newest keyframe."""
         return list(self._scans)
+
+    @property
+    def landmarks(self) -> LandmarkPoints:
+        """Landmarks whose tracks go on, in map."""
+        return self._points
+
+    def adopt(self, landmarks: LandmarkPoints) -> None:
+        """Take what a window that has just ended knew of the depths; only while this one has a single keyframe.
+
+        The prior on each depth is as wide as the old window left it, not narrower than its poses are known.
+        """
+        rows = self._landmarks.rows_of(landmarks.ids)
+        points = transform(inverse(self._records[0].T_map_camera), landmarks.positions)
+        usable = (rows >= 0) & (points[:, 2] > self._depths.near)
+        rows, depth = rows[usable], points[usable, 2]
+        relative = np.linalg.norm(landmarks.spread[usable], axis=1) / np.linalg.norm(points[usable], axis=1)
+        arrays = self._landmarks.arrays
+        arrays.rho[rows] = 1.0 / depth
+        arrays.prior[rows, 0], arrays.prior[rows, 1] = 1.0 / depth, np.maximum(relative, _ADOPTED_SIGMA) / depth
+        self._landmarks.information[rows] = 0.0
+        self._points = self._landmarks.points(self._keyframe_poses())
 
     def recent_keyframes(self, count: int) -> list[int]:
         """Return the stamps of the newest ``count`` keyframes."""
