@@ -8,6 +8,7 @@ map remembers.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -25,10 +26,11 @@ from vli_mapping.point_map import PointMap
 from vli_mapping.registration import ICP_VOXEL_M, Surface, surface_of
 from vli_mapping.scan_window import PosedScan
 
-_VIEWS = 6
-"""Views that are remembered; more would be older than the window."""
-_MIN_SUPPORT, _MARGIN = 40, 2.0
-"""Features that agree with an answer, and how many times those that agree with one elsewhere."""
+_VIEWS, _REMEMBERED = 6, 64
+"""Views that speak, the newest, since the session drifts; and stamps of which it is remembered that they have."""
+_MIN_SUPPORT, _FIRST_SUPPORT, _MARGIN = 40, 60, 2.0
+"""Features of each view that agree with an answer, on average, and of all views together; and how many times those that agree with
+one elsewhere. On a keyboard some 10 of a view agree with a wrong key, and 50 to 250 with the right one."""
 _ELSEWHERE_M = 5e-3
 _MAX_TILT = float(np.radians(3.0))
 """Between two frames that gravity levels."""
@@ -36,7 +38,7 @@ _MIN_OVERLAP, _MIN_AGREEING = 300, 0.8
 """Points of the window's stripes that the map has, one a voxel, and the share of these that agree."""
 _MAX_MOVE_M = 3e-3
 """By which the stripes may correct what the features say."""
-_MIN_LIKENESS, _MIN_SAMPLES = 0.4, 200
+_MIN_LIKENESS, _MIN_SAMPLES = 0.6, 200
 _ROOM_M = 3e-3
 _SIGMA_FLOOR_M, _MAX_SIGMA_M = 5e-5, 2e-4
 """Of the map itself, on top of what the residuals say; and beyond which an answer waits for more views."""
@@ -97,19 +99,22 @@ class Relocaliser:
         self._is_levelled, self._counters = is_levelled, counters
         self._index = PlaceIndex(keyframes, camera)
         self._evidence: list[Evidence] = []
-        self._looks: list[tuple[FloatArray, ByteArray]] = []
+        self._thumbnails: dict[int, ByteArray] = {}
+        self._seen: deque[int] = deque(maxlen=_REMEMBERED)
         self._hypotheses: list[FloatArray] = []
 
     def has_seen(self, stamp_ns: int) -> bool:
         """Return True where a view of this stamp has been taken."""
-        return any(item.stamp_ns == stamp_ns for item in self._evidence)
+        return stamp_ns in self._seen
 
     def add_view(self, view: View) -> None:
         """Take one more view."""
         features: ImageFeatures = describe_image(view.pixels)
         evidence, hypotheses = self._index.match(view.stamp_ns, features, view.T_session_camera)
-        self._evidence = [*self._evidence, evidence][-_VIEWS:]
-        self._looks = [*self._looks, (view.T_session_camera, features.thumbnail)][-_VIEWS:]
+        self._evidence = sorted([*self._evidence, evidence], key=lambda item: item.stamp_ns)[-_VIEWS:]
+        self._thumbnails[view.stamp_ns] = features.thumbnail
+        self._thumbnails = {item.stamp_ns: self._thumbnails[item.stamp_ns] for item in self._evidence}
+        self._seen.append(view.stamp_ns)
         self._hypotheses = [*self._hypotheses, *filter(self._is_level, hypotheses)][-4 * _VIEWS :]
         self._counters.add("relocalisation_views")
 
@@ -154,7 +159,7 @@ class Relocaliser:
         if not ranked:
             raise _InDoubtError("nothing_alike")
         support, T = max(ranked, key=lambda item: item[0])
-        if support < _MIN_SUPPORT:
+        if support < max(_MIN_SUPPORT * len(self._evidence), _FIRST_SUPPORT):
             raise _InDoubtError("few_features")
         elsewhere = max((other for other, rival in ranked if self._shift(rival, T) > _ELSEWHERE_M), default=0)
         if _MARGIN * elsewhere > support:
@@ -186,9 +191,9 @@ class Relocaliser:
             [item.probe(100).points @ item.T_map_camera[:3, :3].T + item.T_map_camera[:3, 3] for item in scans]
         )
         values = []
-        for T_session_camera, thumbnail in self._looks:
-            now = self._sample(thumbnail, T_session_camera, spots)
-            near = self._nearest_keyframe(T_map_session @ T_session_camera)
+        for item in self._evidence:
+            now = self._sample(self._thumbnails[item.stamp_ns], item.T_session_camera, spots)
+            near = self._nearest_keyframe(T_map_session @ item.T_session_camera)
             then = self._sample(near.thumbnail, near.T_map_camera, transform(T_map_session, spots))
             both = np.isfinite(now) & np.isfinite(then)
             if both.sum() >= _MIN_SAMPLES:
