@@ -36,7 +36,7 @@ from vli_common.types import Counters, Mode
 T = TypeVar("T")
 
 _STATUS_PERIOD_S = 1.0
-_FINISH_PERIOD_S = 0.1
+_LOOK_PERIOD_S = 0.1
 _QUEUE_DEPTHS = 12
 """The worker's queue holds this many times the depth of the topic."""
 _WAITING_HINT = "waiting for a calibration: give 'calibration_file' to the driver node or to this one"
@@ -352,15 +352,15 @@ class VliNode(ManagedNode):
         self.create_subscription(message_type(STATUS), STATUS.name, self._on_status, quality(STATUS, reading=True))
         self.create_subscription(String, CALIBRATION.name, self._on_calibration, quality(CALIBRATION))
         self.every(_STATUS_PERIOD_S, self.publish_status)
-        self.every(_FINISH_PERIOD_S, self._check_finish)
-        self.every(_FINISH_PERIOD_S, self._tell_links)
+        self.every(_LOOK_PERIOD_S, self._look_around)
         self.every(_STATUS_PERIOD_S, self._match)
         self.serve("reset", lambda: f"session {self.raise_session(f'reset of {self.get_name()}').number}")
         self.serve("pause", self._pause)
         self.serve("resume", self._resume)
 
-    def _tell_links(self) -> None:
-        """Say at once when an input finds its publisher, or loses it: others wait for that."""
+    def _look_around(self) -> None:
+        """Say at once when an input finds its publisher, or loses it, since others wait for that; and see whether this is the end."""
+        self._check_finish()
         unmatched = self._unmatched()
         if unmatched != self._told_unmatched:
             self._told_unmatched = unmatched
