@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable
 from typing import Any
@@ -14,11 +15,12 @@ from rclpy.node import Node
 from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
-from vli_bringup.graph import STAGES
+from vli_bringup.graph import SCANNER, STAGES
 from vli_bringup.latency import FrameLatencies
 from vli_bringup.processes import GraphError
 from vli_bringup.recorder import Recorder
 from vli_common.arrays import FloatArray
+from vli_common.errors import MessageError
 from vli_common.geometry import inverse
 from vli_common.messages import (
     from_time,
@@ -38,6 +40,7 @@ LISTENER = "replay"
 
 _SPIN_S = 0.1
 _BACK_END = "backend_node"
+_NODES = (SCANNER, *(name for _, name in STAGES))
 _RECORDED = (POSE, WINDOW, ODOMETRY)
 
 
@@ -57,6 +60,8 @@ class GraphListener:
         self._poses: dict[int, FloatArray] = {}
         self._odometries: dict[int, Odometry] = {}
         self._received = Counters()
+        self.malformed = Counters()
+        """Messages by topic that were dropped."""
         self.node: Node
         """The listener's own, while it is in the graph."""
 
@@ -94,7 +99,7 @@ class GraphListener:
     def value(self, node: str, name: str) -> int:
         """Return a number out of the newest status of a node, zero where it has none of this name."""
         status = self.statuses.get(node)
-        return int(float(status.values.get(name, "0"))) if status else 0
+        return _count(status.values.get(name, "0")) if status else 0
 
     def losses(self) -> dict[str, int]:
         """Return ``node.topic`` → messages that never reached their stage.
@@ -102,16 +107,15 @@ class GraphListener:
         Lost on the way (sent by one node, not received by the next), dropped by an overloaded node, malformed, of another
         session, or too early; feedback (``bias``), of which only the newest matters, does not count.
         """
-        sent = {
-            key[5:]: int(value) for status in self.statuses.values() for key, value in status.values.items() if key[:5] == "sent."
-        }
+        values = [item for status in self.statuses.values() for item in status.values.items()]
+        sent = {key[5:]: _count(value) for key, value in values if key[:5] == "sent."}
         lost: dict[str, int] = {}
         for node, status in sorted(self.statuses.items()):
             for key, value in status.values.items():
                 kind, _, name = key.partition(".")
                 if name == BIAS.name or kind not in ("received", "dropped", "node"):
                     continue
-                count = sent.get(name, 0) - int(value) if kind == "received" else int(value)
+                count = sent.get(name, 0) - _count(value) if kind == "received" else _count(value)
                 if count > 0:
                     lost[f"{node}.{name}"] = lost.get(f"{node}.{name}", 0) + count
         missed = {f"{LISTENER}.{topic.name}": sent.get(topic.name, 0) - self._received[topic.name] for topic in _RECORDED}
@@ -151,7 +155,18 @@ class GraphListener:
         self._publisher.publish(status_to_message(StageStatus(time.time_ns(), LISTENER, Health.OK, NodeState.READY, "", values)))
 
     def _subscribe(self, topic: Topic, handle: Callable[..., None]) -> Subscription:
-        return self.node.create_subscription(message_type(topic), topic.name, handle, quality(topic, reading=True))
+        """Subscribe; what is malformed, or says of a node what no node says, is dropped and counted."""
+
+        # With the signature of ``handle``, by which rclpy tells whether to hand over the times of the message.
+        @functools.wraps(handle)
+        def guarded(*arguments: Any) -> None:
+            try:
+                handle(*arguments)
+            except (MessageError, ValueError, KeyError) as error:
+                self.malformed.add(topic.name)
+                self.node.get_logger().warning(f"'{topic.name}': {error}", throttle_duration_sec=5.0)
+
+        return self.node.create_subscription(message_type(topic), topic.name, guarded, quality(topic, reading=True))
 
     def _on_pose(self, message: PoseStamped, info: dict[str, Any]) -> None:
         self._received.add(POSE.name)
@@ -182,7 +197,7 @@ class GraphListener:
 
     def _on_status(self, message: Any) -> None:
         status = status_from_message(message)
-        if status.node == LISTENER:
+        if status.node not in _NODES:
             return
         self.statuses[status.node] = status
         if "due_stamp_ns" in status.values:
@@ -190,3 +205,11 @@ class GraphListener:
         if status.node == _BACK_END and "tracking" in status.values:
             values = status.values
             self._recorder.add_state(int(values["stamp_ns"]), TrackingState(values["tracking"]), values["reason"])
+
+
+def _count(text: str) -> int:
+    """Return a whole number out of a status, zero where there is none."""
+    try:
+        return int(float(text))
+    except (ValueError, OverflowError):
+        return 0

@@ -35,6 +35,13 @@ def test_messages_lost_on_the_way_and_dropped_by_a_node_are_counted(listener: Gr
     assert listener.losses() == {"mapping_node.image_long": 5}
 
 
+def test_what_a_status_says_need_not_be_a_number(listener: GraphListener) -> None:
+    values = {"sent.image_long": "many", "position_ns": "1e999", "received.image_long": "", "node.x": "-"}
+    listener.statuses["demux_node"] = StageStatus(0, "demux_node", Health.OK, NodeState.READY, "", values)
+    assert listener.losses() == {}
+    assert listener.value("demux_node", "position_ns") == 0
+
+
 def test_poses_that_never_reached_the_recorder_are_counted(listener: GraphListener) -> None:
     listener.statuses["backend_node"] = status("backend_node", sent__pose=3, sent__window=0)
     assert listener.losses() == {f"{LISTENER}.pose": 3}
