@@ -29,13 +29,13 @@ from vli_mapping.scan_window import PosedScan
 _VIEWS, _REMEMBERED = 6, 64
 """Views that speak, the newest, since the session drifts; and stamps of which it is remembered that they have."""
 _MIN_SUPPORT, _FIRST_SUPPORT, _MARGIN = 40, 60, 2.0
-"""Features of each view that agree with an answer, on average, and of all views together; and how many times those that agree with
-one elsewhere. On a keyboard some 10 of a view agree with a wrong key, and 50 to 250 with the right one."""
+"""Features of each view that agree with an answer, on average, and of all views together; and how many times those that agree
+with one elsewhere. On a keyboard some 10 of a view agree with a wrong key, and 50 to 250 with the right one."""
 _ELSEWHERE_M = 5e-3
 _MAX_TILT = float(np.radians(3.0))
 """Between two frames that gravity levels."""
-_MIN_OVERLAP, _MIN_AGREEING = 300, 0.8
-"""Points of the window's stripes that the map has, one a voxel, and the share of these that agree."""
+_MIN_SCANS, _MIN_OVERLAP, _MIN_AGREEING = 20, 300, 0.8
+"""Stripes: with fewer, the window has only just begun; their points that the map has, one a voxel; share of these that agrees."""
 _MAX_MOVE_M = 3e-3
 """By which the stripes may correct what the features say."""
 _MIN_LIKENESS, _MIN_SAMPLES = 0.6, 200
@@ -134,6 +134,8 @@ class Relocaliser:
 
     def _located(self, scans: Sequence[PosedScan]) -> Place:
         T, support = self._most_supported()
+        if len(scans) < _MIN_SCANS:
+            raise _InDoubtError("few_scans")
         found = self._aligned(scans, T)
         if found.fit.overlap < _MIN_OVERLAP:
             raise _InDoubtError("off_the_map")
