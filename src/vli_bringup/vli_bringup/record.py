@@ -74,20 +74,21 @@ def summary(recorded: list[RecordedTopic], path: Path) -> str:
 
 def _record(listener: RecordingListener, writer: WriterThread, stop: threading.Event, duration_s: float | None) -> None:
     """Take what comes until told to stop, or until the disk fails."""
-    start_s = time.monotonic()
-    is_silence_told = False
+    start_s, elapsed_s, is_silence_told = time.monotonic(), 0.0, False
     with tqdm(bar_format="{desc}", disable=not sys.stderr.isatty(), leave=False) as line:
-        while not stop.is_set() and writer.error is None:
+        while not stop.is_set() and writer.error is None and (duration_s is None or elapsed_s < duration_s):
+            elapsed_s = time.monotonic() - start_s
+            if writer.is_behind:
+                stop.wait(_SPIN_S)
+                continue
             for text in listener.spin(_SPIN_S):
                 line.write(f"vli record: {text}", file=sys.stderr)
-            elapsed_s = time.monotonic() - start_s
-            if duration_s is not None and elapsed_s >= duration_s:
-                break
             if elapsed_s > _PATIENCE_S and not is_silence_told and (missing := listener.missing()):
                 names = " and ".join(f"'{name}'" for name in missing)
                 line.write(f"vli record: nobody publishes {names} yet", file=sys.stderr)
                 is_silence_told = True
             line.set_description_str(_progress(listener.recorded, elapsed_s))
+        writer.take_the_rest()
         listener.close()
 
 

@@ -144,6 +144,30 @@ def test_messages_that_the_disk_cannot_follow_are_dropped_and_counted(tmp_path: 
     assert numbers_in(writer.path) == list(range(10))
 
 
+def test_a_disk_that_is_behind_is_told_before_anything_is_lost_and_the_rest_is_taken_in_the_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    writer, imu, gate = BagWriter(tmp_path, "scan"), imu_topic(), threading.Event()
+    write = writer.write
+
+    def slow(topic: RecordedTopic, item: RawMessage) -> None:
+        gate.wait(10.0)
+        write(topic, item)
+
+    monkeypatch.setattr(writer, "write", slow)
+    thread = WriterThread(writer, limit=1000)
+    behind = []
+    for number in range(10):
+        behind.append(thread.is_behind)
+        assert thread.put(imu, message(number, 100))
+    thread.take_the_rest()
+    assert all(thread.put(imu, message(number, 100)) for number in range(10, 30))
+    gate.set()
+    assert thread.close() is None
+    assert behind == [False] * 6 + [True] * 4
+    assert numbers_in(writer.path) == list(range(30))
+
+
 def test_a_recording_that_was_cut_off_is_not_replaced_unasked(tmp_path: Path) -> None:
     out = tmp_path / "scan"
     with RecordingDirectory(out, overwrite=False) as directory:

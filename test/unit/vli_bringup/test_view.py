@@ -186,6 +186,19 @@ def test_a_running_scan_shows_map_updates_and_stripes_of_one_session(scene: Scen
     assert (len(node(scene, "/stripes").points), len(node(scene, "/map").points)) == (4, 0)
 
 
+def test_who_comes_late_looks_at_all_of_the_map(scene: Scene) -> None:
+    display = LiveDisplay(scene)
+    small, large = cloud(50), cloud(50)
+    large.points[:] *= 10.0
+    display.add_stripes(small)
+    near = np.linalg.norm(scene.server.initial_camera.position - scene.server.initial_camera.look_at)
+    display.add_stripes(large)
+    assert np.linalg.norm(scene.server.initial_camera.position - scene.server.initial_camera.look_at) == pytest.approx(near)
+    display.add_map(large)
+    far = np.linalg.norm(scene.server.initial_camera.position - scene.server.initial_camera.look_at)
+    assert far == pytest.approx(10 * near, rel=1e-3)
+
+
 def test_the_state_of_a_running_scan_is_in_words(scene: Scene) -> None:
     display = LiveDisplay(scene)
     assert "nothing has come yet" in display.text.content
@@ -195,8 +208,8 @@ def test_the_state_of_a_running_scan_is_in_words(scene: Scene) -> None:
     assert display.text.content.split("\n\n") == [
         "## LOST",
         "no features",
-        "- 🔴 **backend_node** ready: move slower",
-        "- 🟢 **demux_node** ready (3.10 ms)",
+        "- ✗ **backend_node** ready: move slower",
+        "- ✓ **demux_node** ready (3.10 ms)",
     ]
     assert status_text({}) == ""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 import time
 from collections import deque
@@ -46,6 +47,17 @@ class WriterThread:
             self._waiting += len(message.data)
             self._changed.notify()
             return True
+
+    @property
+    def is_behind(self) -> bool:
+        """True while half of what may wait does: further messages are better left to the middleware, which has room too."""
+        with self._changed:
+            return self._waiting > self._limit // 2
+
+    def take_the_rest(self) -> None:
+        """Refuse nothing any more: what comes from now on has come already, and waits in the middleware."""
+        with self._changed:
+            self._limit = sys.maxsize
 
     def close(self) -> OSError | None:
         """Write what waits, then index and metadata; return what made the disk fail, now or before."""

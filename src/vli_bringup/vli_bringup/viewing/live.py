@@ -20,7 +20,7 @@ _UPDATES = 120
 """Updates that wait for the next whole map; at three keyframes a second and a map every 2 s, a few would do."""
 _PATH_RGB: Rgb = (230, 120, 20)
 _CAMERA_M = 5e-3
-_MARKS = {Health.OK: "🟢", Health.WARN: "🟡", Health.ERROR: "🔴", Health.STALE: "⚪"}
+_MARKS = {Health.OK: "✓", Health.WARN: "!", Health.ERROR: "✗", Health.STALE: "?"}
 
 
 class LiveDisplay:
@@ -48,7 +48,7 @@ class LiveDisplay:
         self._map.show(cloud)
         while self._updates:
             self._updates.popleft().remove()
-        self._place(cloud)
+        self._place(cloud, is_whole=True)
 
     def add_update(self, cloud: PointCloud) -> None:
         """Take points that are new in the map."""
@@ -92,9 +92,10 @@ class LiveDisplay:
             self._map.show(PointCloud(0, empty, empty.astype(np.uint8), session=session))
         self._session = session
 
-    def _place(self, cloud: PointCloud) -> None:
-        if not self._is_placed and len(cloud):
-            self._scene.look_at(cloud.points)
+    def _place(self, cloud: PointCloud, is_whole: bool = False) -> None:
+        """Look at the first that comes; a map that has grown is for the browsers that come later."""
+        if len(cloud) and (is_whole or not self._is_placed):
+            self._scene.look_at(cloud.points, move=not self._is_placed)
             self._is_placed = True
 
 

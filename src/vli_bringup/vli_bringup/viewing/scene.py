@@ -85,13 +85,18 @@ class Scene:
         corners = (size_m * _FRUSTUM) @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
         return self._lines(name, corners[:, _EDGES].reshape(-1, 2, 3), colour)
 
-    def look_at(self, points: Float32Array | FloatArray) -> None:
-        """Show all of the points (N, 3) from above and aside, above a grid of centimetres."""
+    def look_at(self, points: Float32Array | FloatArray, move: bool = True) -> None:
+        """Show all of the points (N, 3) from above and aside, above a grid of centimetres.
+
+        Args:
+            points: of a map.
+            move: False leaves the eye of browsers that are there where it is: this is for those that come.
+        """
         if not len(points):
             return
         low, high = np.percentile(points, [1, 99], axis=0)
         centre, extent = (low + high) / 2, max(float(np.linalg.norm(high - low)), _LEAST_EXTENT_M)
-        self.view_from(centre + extent * _ASIDE, centre)
+        self.view_from(centre + extent * _ASIDE, centre, move)
         self.server.scene.add_grid(
             "/grid",
             width=4 * extent,
@@ -101,10 +106,10 @@ class Scene:
             position=(centre[0], centre[1], low[2] - 0.05 * extent),
         )
 
-    def view_from(self, position: FloatArray, target: FloatArray) -> None:
-        """Place the camera of the browsers that are there and of those that come."""
+    def view_from(self, position: FloatArray, target: FloatArray, move: bool = True) -> None:
+        """Place the eye of the browsers that come and, to ``move`` them, of those that are there."""
         self.server.initial_camera.position, self.server.initial_camera.look_at = position, target
-        for client in self.server.get_clients().values():
+        for client in self.server.get_clients().values() if move else ():
             client.camera.position, client.camera.look_at = position, target
 
     def _lines(self, name: str, segments: FloatArray, colour: Rgb) -> Any:
