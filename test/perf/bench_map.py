@@ -28,6 +28,7 @@ from vli_driver.config import DemuxConfig, StripeConfig
 from vli_driver.decode import decode
 from vli_driver.demux import Demultiplexer
 from vli_driver.scanner import StripeScanner
+from vli_mapping.config import MappingConfig
 from vli_mapping.contradiction import contradict
 from vli_mapping.mapper import Mapper
 from vli_mapping.point_map import PointMap, Stripe
@@ -109,12 +110,18 @@ def scan_with_truth(data: Path, calibration: Calibration, error_m: float) -> Map
     return time_with_truth(data, calibration, error_m).mapper
 
 
-def time_with_truth(data: Path, calibration: Calibration, error_m: float) -> Timed:
-    """Map a recording with true poses but for ``error_m``; each window comes when its frames have."""
-    timed = Timed(Mapper(calibration))
+def time_with_truth(
+    data: Path,
+    calibration: Calibration,
+    error_m: float,
+    config: MappingConfig | None = None,
+    frames: Iterable[Image | LaserScan] | None = None,
+) -> Timed:
+    """Map a recording, or other ``frames`` of it, with true poses but for ``error_m``; each window comes when its frames have."""
+    timed = Timed(Mapper(calibration, config))
     windows = true_windows(read_tum(data / "truth.tum"), error_m)
     window = next(windows, None)
-    for frame in read_frames(data, calibration):
+    for frame in read_frames(data, calibration) if frames is None else frames:
         while window is not None and window.stamp_ns < frame.stamp_ns:
             timed.add(window)
             window = next(windows, None)
