@@ -85,7 +85,7 @@ def test_f6_a_flash_in_a_short_frame_is_rejected(first_part, truth, clean_first_
     assert rmse_mm(found.live(), truth) < 0.03
 
 
-@pytest.mark.parametrize("gain", [2.0, 0.5])
+@pytest.mark.parametrize("gain", [2.0, pytest.param(0.5, marks=pytest.mark.slow)])
 def test_f7_a_step_of_brightness_loses_few_tracks(first_part, truth, scan, gain):
     """In the six long frames after the step, of a hundred tracks."""
     before = until(first_part, 2.2)

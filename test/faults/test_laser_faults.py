@@ -39,9 +39,9 @@ def double(pixels):
 
 
 def interreflection(pixels):
-    """A second bounce off a wall: farther away, dimmer and blurred."""
+    """A second bounce off a wall: farther away, half as bright and blurred."""
     bounced = cv2.GaussianBlur(np.roll(pixels, 30, axis=0), (0, 0), 5.0)
-    return np.maximum(pixels, np.minimum(3 * bounced.astype(np.int32), 255).astype(np.uint8))
+    return np.maximum(pixels, np.minimum(1.5 * bounced, 255).astype(np.uint8))
 
 
 def saturated(pixels):
