@@ -128,7 +128,7 @@ class NodeProcesses:
 def _start(arguments: Sequence[str]) -> tuple[subprocess.Popen[bytes], IO[bytes]]:
     """Return a running process, and the file that its standard error goes to."""
     log = tempfile.TemporaryFile()  # noqa: SIM115  It lives as long as the process.
-    environment = {**os.environ, STOP_WITH_PARENT: "1"}
+    environment = {**os.environ, STOP_WITH_PARENT: str(os.getpid())}
     # A session of its own: Ctrl-C is for the command, which has things to ask of the nodes before it stops them.
     process = subprocess.Popen(
         arguments, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=log, env=environment, start_new_session=True

@@ -76,7 +76,7 @@ def test_a_node_that_is_too_slow_for_good_keeps_its_latency_and_leaves_out_what_
 def test_once_the_machine_is_fast_again_nothing_more_is_left_out() -> None:
     queue = Queue()
     queue.run(10.0, 2.0 * PERIOD_S)
-    queue.run(2.0, 0.5 * PERIOD_S)
+    queue.run(2.0 * INTERVAL_S, 0.5 * PERIOD_S)
     before = queue.shed
     assert before > 0
     queue.run(1.0, 0.5 * PERIOD_S)

@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 TARGET_S = 0.1
 """Messages that have waited longer are late. Two stages in a row that are too slow still answer within 200 ms."""
-INTERVAL_S = 1.0
+INTERVAL_S = 2.0
 
 
 class Backlog:

@@ -359,7 +359,7 @@ class VliNode(ManagedNode):
         self.serve("resume", self._resume)
 
     def _look_around(self) -> None:
-        """Say at once when an input finds its publisher, or loses it, since others wait for that; and see whether this is the end."""
+        """See whether this is the end, and say at once when an input finds its publisher, or loses it: others wait for that."""
         self._check_finish()
         unmatched = self._unmatched()
         if unmatched != self._told_unmatched:

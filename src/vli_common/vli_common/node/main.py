@@ -30,7 +30,7 @@ _SIGNAL_S = 0.1
 _TEARDOWN_S = 3.0
 """The middleware may take this long to let go of a node that has stopped, its worker's last job included."""
 STOP_WITH_PARENT = "VLI_STOP_WITH_PARENT"
-"""Environment variable: where it is set, the node stops when the process that started it is gone."""
+"""Environment variable: process id of who started the node; it stops when that is not its parent any more."""
 _UNUSABLE = 2
 _FAILED = 1
 
@@ -90,7 +90,8 @@ def _limit_teardown(code: int) -> None:
 def _spin(node: VliNode) -> None:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    parent = os.getppid() if os.environ.get(STOP_WITH_PARENT) else None
+    told = os.environ.get(STOP_WITH_PARENT, "")
+    parent = int(told) if told.isdecimal() else None
     while not (STOP.is_set() or node.failure or node.is_shut_down or parent not in (None, os.getppid())):
         executor.spin_once(timeout_sec=_SIGNAL_S)
         time.sleep(_REST_S)
