@@ -35,6 +35,8 @@ class Recorder:
         """Stamp → covariance (6, 6) of the live pose of the camera, order of ROS, axes of map; where it was given."""
         self.states: list[tuple[float, str, str]] = []
         """Stamp in seconds, state and reason, at each change of the state."""
+        self._window: WindowPoses | None = None
+        self._placed: list[int] = []
         self.reason = "no long frame reached the back end"
         """What the back end said last."""
 
@@ -78,8 +80,22 @@ class Recorder:
 
     def _add_window(self, window: WindowPoses) -> None:
         self._keyframes.update(window.stamps[window.kinds == FrameKind.KEYFRAME.value].tolist())
+        if self._window is None or window.placement != self._window.placement or window.session != self._window.session:
+            self._begin_placement(window)
+        self._window = window
         leaving = window.final & (window.kinds != FrameKind.SHORT.value)
         self.final.update(zip(window.stamps[leaving].tolist(), window.T_map_camera[leaving], strict=True))
+        self._placed += window.stamps[leaving].tolist()
+
+    def _begin_placement(self, window: WindowPoses) -> None:
+        """Move what has left the window since the last placement to where a relocalisation puts the window, as the map does."""
+        old = self._window
+        if old is not None and old.session == window.session:
+            _, before, now = np.intersect1d(old.stamps[~old.final], window.stamps, return_indices=True)
+            if len(now):
+                T_map_session = window.T_map_camera[now[-1]] @ inverse(old.T_map_camera[~old.final][before[-1]])
+                self.final.update((stamp, T_map_session @ self.final[stamp]) for stamp in self._placed)
+        self._placed.clear()
 
 
 def tum_text(poses: Mapping[int, FloatArray]) -> str:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -67,6 +69,22 @@ def test_the_final_trajectory_has_the_long_frames_that_left_the_window_and_were_
     recorder.write(tmp_path)
     assert [row[1] for row in lines(tmp_path / "trajectory_final.tum")] == ["10.000000000", "20.000000000", "40.000000000"]
     assert recorder.keyframes == 3
+
+
+def test_what_left_the_window_before_a_relocalisation_is_where_the_map_has_it(recorder, tmp_path):
+    key, lost = FrameKind.KEYFRAME.value, pose(so3_exp(np.array([0, 0, 0.5])), np.array([7.0, 8.0, 9.0]))
+    recorder.add([output(stamp) for stamp in (1, 2, 3, 4, 5)])
+    recorder.add([window([1, 2], [key, key], [True, True])])
+    recorder.add([moved(window([3, 4], [key, key], [True, False]), lost, 1)])
+    recorder.add([moved(window([4, 5], [key, key], [True, True]), np.eye(4), 2)])
+    recorder.write(tmp_path)
+    rows = np.array(lines(tmp_path / "trajectory_final.tum"), float)
+    np.testing.assert_allclose(rows[:, 1:4], [[1, 0, 0], [2, 0, 0], [3, 0, 0], [4, 0, 0], [5, 0, 0]], atol=1e-8)
+
+
+def moved(poses, T, placement):
+    """Return a window as a back end sends it that takes ``T`` for the place of its world in the map."""
+    return replace(poses, T_map_camera=T @ poses.T_map_camera, placement=placement)
 
 
 def test_states_are_listed_when_they_change_and_the_last_reason_is_kept(recorder):
