@@ -1,6 +1,6 @@
 """Put down anywhere on what is mapped: how soon the scanner finds its place in the map of an earlier scan, and how well.
 
-    python test/perf/bench_relocalisation.py RECORDING [--map 66] [--tries 20] [--seed 1] [--scan DIR]
+    python test/perf/bench_relocalisation.py [RECORDING] [--map 13] [--tries 20] [--seed 1] [--scan DIR]
 
 The first ``--map`` seconds of a recording (a directory with ``bag``, ``calibration.yaml`` and ``truth.tum``) make the map; each
 try is a new session that begins at a random time after that, where the true path runs over the mapped part, and is given that map
@@ -30,6 +30,7 @@ from vli_common.geometry import align, transform
 from vli_common.types import NANOSECONDS, Mode, WindowPoses
 from vli_driver.bag import BagReader
 
+DATA = Path(__file__).resolve().parents[3] / "shared/data/keyboard_short"
 MAX_S, MAX_MM = 2.0, 0.5
 _WATCHED_S, _AFTER_S = 8.0, 1.0
 _MAPPED_M = 0.015
@@ -115,8 +116,8 @@ def _times(truth: Trajectory, mapped_s: float, count: int, rng: np.random.Genera
 def main() -> None:
     """Make the map, try all starts, print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("recording", type=Path)
-    parser.add_argument("--map", type=float, default=66.0, help="seconds of the recording that make the map")
+    parser.add_argument("recording", nargs="?", type=Path, default=DATA)
+    parser.add_argument("--map", type=float, default=13.0, help="seconds of the recording that make the map")
     parser.add_argument("--tries", type=int, default=20)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--scan", type=Path, help="results of 'vli run --duration MAP' that are there already")
