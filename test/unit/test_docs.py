@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import re
+import shlex
 from pathlib import Path
 
 import pytest
 
+from vli_bringup.cli import make_parser
 from vli_bringup.graph import NODE_ONLY
 from vli_bringup.settings import Settings
 from vli_common.config import parameters
@@ -72,3 +74,21 @@ def test_parameters_named_in_the_docs_exist(page: str) -> None:
 def test_relative_links_lead_somewhere(page: Path) -> None:
     targets = [target.partition("#")[0] for target in LINK.findall(page.read_text()) if "://" not in target]
     assert [target for target in targets if target and not (page.parent / target).exists()] == []
+
+
+def commands(page: Path) -> list[str]:
+    """Return every ``vli`` command line in the shell blocks of a page."""
+    blocks = re.findall(r"```sh\n(.*?)```", page.read_text(), re.DOTALL)
+    lines = [line.partition(" #")[0].strip() for block in blocks for line in block.replace("\\\n", " ").splitlines()]
+    return [line for line in lines if line.startswith("vli ")]
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if commands(page)], ids=lambda page: page.name)
+def test_every_command_of_a_page_has_the_arguments_that_it_takes(page: Path) -> None:
+    for line in commands(page):
+        arguments = shlex.split(line)[1:]
+        try:
+            _, unknown = make_parser(arguments[0]).parse_known_args(arguments)
+        except SystemExit:
+            pytest.fail(f"'{line}' is refused")
+        assert unknown == [], line
