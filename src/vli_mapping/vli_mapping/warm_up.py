@@ -11,6 +11,7 @@ from vli_mapping.colour import colour_points
 from vli_mapping.config import AssociationConfig, EntryConfig, MapConfig
 from vli_mapping.contradiction import contradict
 from vli_mapping.entry import away_from_edges, facing, noisy, supported
+from vli_mapping.map_keyframes import meet
 from vli_mapping.normals import smooth_normals, stripe_normals
 from vli_mapping.point_map import PointMap, Stripe
 from vli_mapping.scan_window import PosedScan
@@ -37,6 +38,7 @@ def warm_up() -> None:
     every, normals, planarity = np.ones(64, np.bool_), np.zeros((64, 3), np.float32), np.zeros(64, np.float32)
     posed = PosedScan(scan, 1000, np.eye(4), np.zeros((64, 3), np.float32), every, every, normals, planarity)
     associate(point_map, [posed], 0, AssociationConfig(min_age_s=0.0), Counters())
+    meet(point_map, np.eye(4), np.zeros((2, 2)), 0.03)
     thin(point_map.columns.position[: point_map.rows], point_map.columns.weight[: point_map.rows], 8)
     camera = make_camera("none", (100.0, 100.0, 8.0, 8.0), (), (16, 16))
     for shape in ((16, 16, 3), (16, 16)):
