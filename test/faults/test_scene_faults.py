@@ -89,8 +89,8 @@ def test_f17_a_fast_shake_puts_nothing_wrong_into_the_map():
     points = found.pipeline.stages.mapper.cloud().points.astype(np.float64)
     off = surface_distances(transform(map_in_truth(found.live(), recording.truth), points), recording.triangles)
     assert (off.to_point < 1e-3).all()
-    # Stripes lie between long frames 33 ms apart, and a shake of 5 Hz is not straight in between.
-    assert (off.to_point > 5e-4).mean() < 0.05
+    # Stripes lie between long frames 33 ms apart; straight lines between those would put 3 % off.
+    assert (off.to_point > 5e-4).mean() < 0.015
 
 
 @pytest.mark.parametrize("scene", ["plate", pytest.param("bar", marks=pytest.mark.slow)])

@@ -1,9 +1,9 @@
 """Frames between keyframes: where each stripe was, given the keyframes around it.
 
 Eq. (4) interpolates the pose of a stripe between the adjacent keyframes. Under hand tremor that alone misplaces it by some
-0.1 mm, more than the laser's noise. So the measured shape of the motion is folded in: every long frame has a pose of its own; a
-frame's deviation from the interpolation, δ = interp(T_k, T_k+1, α)⁻¹ T, is taken once when the interval closes, and kept while
-the keyframes move.
+0.1 mm, more than the laser's noise. So the measured shape of the motion is folded in: every long frame has a pose of its own, and
+a short one that of a cubic through the long ones around it. A frame's deviation from the interpolation,
+δ = interp(T_k, T_k+1, α)⁻¹ T, is taken once when the interval closes, and kept while the keyframes move.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from vli_backend.path_interpolation import interpolate_path
 from vli_common.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArray
 from vli_common.geometry import interpolate, inverse
 from vli_common.types import FrameKind, LaserScan, WindowPoses
@@ -56,7 +57,7 @@ class FrameRecord:
 def close_interval(frames: list[FrameRecord], scans: list[LaserScan]) -> Interval:
     """Return the interval between ``frames[0]`` and ``frames[-1]`` (the keyframes), with the scans taken in it.
 
-    Short frames get the pose between the two long frames around them.
+    Short frames get the pose that the long frames around them tell.
     """
     start, end = frames[0], frames[-1]
     inner = frames[1:-1]
@@ -65,8 +66,7 @@ def close_interval(frames: list[FrameRecord], scans: list[LaserScan]) -> Interva
     scan_stamps = np.array([s.stamp_ns for s in scans], dtype=np.int64)
     before = np.clip(np.searchsorted(stamps, scan_stamps, side="right") - 1, 0, len(frames) - 2)
     poses = np.stack([f.T_map_camera for f in frames])
-    fraction = (scan_stamps - stamps[before]) / (stamps[before + 1] - stamps[before])
-    scan_poses = interpolate(poses[before], poses[before + 1], fraction) if scans else np.empty((0, 4, 4))
+    scan_poses = interpolate_path(stamps, poses, scan_stamps)
     rest = np.array([f.stationary for f in frames], np.bool_)
 
     all_stamps = np.concatenate([stamps[1:-1], scan_stamps])

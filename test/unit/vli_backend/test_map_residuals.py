@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from vli_backend.map_residuals import condense_map, stripe_jacobian
+from vli_backend.path_interpolation import interpolate_path
 from vli_backend.window import FrameRecord, Interval, Window, close_interval
 from vli_common.arrays import FloatArray
 from vli_common.geometry import interpolate, inverse, pose, so3_exp, so3_log, transform
@@ -46,8 +47,8 @@ def test_an_interval_gives_back_the_frames_it_was_made_of() -> None:
     assert list(interval.stamps) == [50, 100, 200, 250, 300, 400]
     poses = interval.poses(T0, T1)
     np.testing.assert_allclose(poses[2], records[2].T_map_camera, atol=1e-12)
-    between = interpolate(records[2].T_map_camera, records[3].T_map_camera, 0.5)
-    np.testing.assert_allclose(poses[3], between, atol=1e-12)
+    path = np.array([record.stamp_ns for record in records]), np.stack([record.T_map_camera for record in records])
+    np.testing.assert_allclose(poses[3], interpolate_path(*path, np.array([250]))[0], atol=1e-12)
     assert interval.kinds[3] == FrameKind.SHORT.value
 
 
