@@ -246,5 +246,5 @@ def test_impossible_boards_are_refused(tmp_path: Path, arguments: tuple[str, ...
 
 def test_an_existing_directory_is_kept(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("precious")
-    with pytest.raises(OutputError, match="exists and is not empty"):
+    with pytest.raises(OutputError, match="is not empty"):
         _run("--out", str(tmp_path))
