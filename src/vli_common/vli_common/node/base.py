@@ -1,56 +1,41 @@
-"""The base of every node: decode → call → publish is all that is left to the node itself.
-
-Callbacks only enqueue; a worker thread decodes and computes, so that 25 ms of work on an image never holds up the IMU.
-"""
+"""The base of every node: decode → call → publish is all that is left to the node itself."""
 
 from __future__ import annotations
 
 import time
 import traceback
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 import rclpy
-from rclpy.clock import Clock, ClockType
-from rclpy.publisher import Publisher
 from std_msgs.msg import Header, String
-from std_srvs.srv import Trigger
 
 from vli_common.calibration import Calibration, load_calibration, parse_calibration, to_yaml
-from vli_common.errors import CalibrationError, MessageError, VliError
+from vli_common.errors import CalibrationError, MessageError
 from vli_common.messages import Session, session_from_message, session_to_message, status_from_message, status_to_message
-from vli_common.node.aside import Aside
 from vli_common.node.backlog import Backlog
 from vli_common.node.inputs import Input
-from vli_common.node.lifecycle import ManagedNode
 from vli_common.node.parameters import NodeConfig, NodeParameters
-from vli_common.node.transport import message_type, pending, quality
-from vli_common.node.worker import Worker
+from vli_common.node.transport import message_type, quality
+from vli_common.node.working import WorkingNode
 from vli_common.status import Health, LatencyMeter, NodeState, StageStatus
-from vli_common.topics import CALIBRATION, DIAGNOSTICS, NAMESPACE, SESSION, STATUS, Topic
+from vli_common.topics import CALIBRATION, DIAGNOSTICS, SESSION, STATUS
 from vli_common.types import Counters, Mode
 
 T = TypeVar("T")
 
 _STATUS_PERIOD_S = 1.0
 _LOOK_PERIOD_S = 0.1
-_QUEUE_DEPTHS = 12
-"""The worker's queue holds this many times the depth of the topic."""
 _WAITING_HINT = "waiting for a calibration: give 'calibration_file' to the driver node or to this one"
-_ASIDE_S = 1.0
-"""A service under way gets this long to end when the node is stopped."""
 _MOST_OTHERS = 64
 """Nodes that are kept in mind; a name costs a sender nothing."""
-_STOP_S = 2.0
-_CALL_S = 10.0
 _DIGITS = 20
 """A number of more digits is none of ours."""
 
 
-class VliNode(ManagedNode):
+class VliNode(WorkingNode):
     """Parameters, calibration, session, worker, status, services, lifecycle.
 
     A subclass makes its publishers and calls :meth:`receive` in its constructor, and overrides the hooks (``create_stage`` …
@@ -66,7 +51,7 @@ class VliNode(ManagedNode):
     """
 
     def __init__(self, name: str, configs: Mapping[type, str], needs_calibration: bool = True) -> None:
-        super().__init__(name, NAMESPACE)
+        super().__init__(name)
         self.parameters = NodeParameters(self, configs)
         self.node_config = self.parameters.config(NodeConfig)
         self.mode = Mode(self.node_config.mode)
@@ -80,17 +65,10 @@ class VliNode(ManagedNode):
         self._needs_calibration = needs_calibration
         self._hint = "waiting for a lifecycle manager to configure it: 'autostart' is false"
         self._calibration_hint = ""
-        self._worker = Worker(name, self.fail)
-        self._aside = Aside(name)
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._backlog = Backlog()
         self.is_behind = False
         """True where the message that is being handled came too long ago, and those before it too: leave out what can be."""
-        self._inputs: dict[str, Input] = {}
         self._told_unmatched = ""
-        self._matchers: list[Callable[[], str | None]] = []
-        self._publishers_by_topic: dict[str, Publisher] = {}
-        self._sent = Counters()
         self._finished_sources: dict[str, dict[str, str]] = {}
         self._started_ns = time.time_ns()
         self.others: dict[str, StageStatus] = {}
@@ -145,129 +123,6 @@ class VliNode(ManagedNode):
     def newest_session(self) -> int:
         """Number of the newest session that was heard of; the worker may still be busy with the one before."""
         return self._newest_session
-
-    # What a node does with topics
-
-    def receive(
-        self,
-        topic: Topic,
-        read: Callable[[Any], T],
-        handle: Callable[[T], None],
-        name: str | None = None,
-        ends: bool = True,
-        required: bool = True,
-        limit: int | None = None,
-        sheds: int = 0,
-    ) -> None:
-        """Subscribe; ``read`` and ``handle`` run in the worker.
-
-        Args:
-            topic: of the table.
-            read: message → type; what it refuses is dropped and counted.
-            handle: gets what is of the present session.
-            name: to subscribe to in place of the topic's own.
-            ends: False for feedback, which does not tell the end of the input.
-            required: False for an input that may have no publisher.
-            limit: messages that may wait for the worker, by default 12 times the depth of the topic.
-            sheds: of this topic, so many in a row are dropped at a time while the worker is behind for good; 0: none.
-        """
-        entry = Input(topic, name or topic.name, ends, required, sheds)
-        most = limit or _QUEUE_DEPTHS * topic.depth
-
-        def accept(message: Any) -> None:
-            entry.count()
-            self._worker.put(topic.name, partial(self._process, entry, read, handle, message, entry.last_s), most)
-
-        def callback(message: Any) -> None:
-            accept(message)
-            for further in pending(entry.subscription):
-                accept(further)
-
-        entry.subscribe(self, callback)
-        self._inputs[topic.name] = entry
-        self._matchers.append(partial(entry.adapt, self, callback))
-
-    def received(self, topic: Topic) -> int:
-        """Return how many messages of a topic of :meth:`receive` have come in this session."""
-        return self._inputs[topic.name].received
-
-    def advertise(self, topic: Topic, name: str | None = None) -> Publisher:
-        """Make the publisher of a topic, for :meth:`send`."""
-        publisher = self.create_publisher(message_type(topic), name or topic.name, quality(topic))
-        self._publishers_by_topic[topic.name] = publisher
-        return publisher
-
-    def send(self, topic: Topic, message: Any) -> None:
-        """Publish, and count for those downstream; a node that is being stopped publishes nothing more."""
-        self._sent.add(topic.name)
-        try:
-            self._publishers_by_topic[topic.name].publish(message)
-        except Exception:
-            if rclpy.ok():
-                raise
-
-    def has_listener(self, topic: Topic) -> bool:
-        """Return True where anyone subscribes to a topic of :meth:`advertise`."""
-        return bool(self._publishers_by_topic[topic.name].get_subscription_count())
-
-    def serve(self, name: str, action: Callable[[], str], aside: bool = False) -> None:
-        """Offer the service ``~/name`` (std_srvs/Trigger), answered with what ``action`` returns or raises.
-
-        Args:
-            name: of the service.
-            action: what it does.
-            aside: run it in a thread of its own, since it takes long: messages are taken meanwhile. One at a time.
-        """
-
-        async def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-            try:
-                response.message = await self._aside.run(action, self.executor) if aside else action()
-                response.success = True
-            except Exception as error:
-                response.success, response.message = False, str(error)
-            return response
-
-        self.create_service(Trigger, f"~/{name}", answer)
-
-    def every(self, period_s: float, action: Callable[[], None]) -> None:
-        """Run an action in the executor again and again, by the machine's own clock.
-
-        With ``use_sim_time`` the clock of ROS stands still while nobody plays: a node must answer all the same.
-        """
-        self.create_timer(period_s, action, clock=self._steady)
-
-    def enqueue(self, job: Callable[[], None]) -> None:
-        """Run a job in the worker, after all that waits there."""
-        self._worker.control(job)
-
-    def call(self, job: Callable[[], T]) -> T:
-        """Run a job in the worker, after all that waits there, and return its result; for services.
-
-        Raises:
-            TimeoutError: the worker did not come to it in 10 s.
-            Exception: what the job raised.
-        """
-        future: Future[T] = Future()
-
-        def run() -> None:
-            try:
-                future.set_result(job())
-            except Exception as error:
-                future.set_exception(error)
-
-        self.enqueue(run)
-        return future.result(_CALL_S)
-
-    @staticmethod
-    def existing(stage: T | None) -> T:
-        """Return a stage object, which is made before anything is handled.
-
-        Raises:
-            VliError: it is not there yet.
-        """
-        if stage is None:
-            raise VliError("the node is not ready: no calibration yet")
-        return stage
 
     def raise_session(self, reason: str, stamp_ns: int = 0) -> Session:
         """Begin a new session here and tell all nodes."""
@@ -329,14 +184,6 @@ class VliNode(ManagedNode):
 
         self.call(drop)
 
-    def close(self) -> bool:
-        """Stop the worker and destroy the node; return False where a job would not end."""
-        self._aside.finish(_ASIDE_S)
-        stopped = self._worker.stop(_STOP_S)
-        if stopped:
-            self.destroy_node()
-        return stopped
-
     def publish_status(self) -> None:
         """Publish ``status`` and ``/diagnostics``."""
         status = self._status()
@@ -365,14 +212,6 @@ class VliNode(ManagedNode):
         if unmatched != self._told_unmatched:
             self._told_unmatched = unmatched
             self.publish_status()
-
-    def _unmatched(self) -> str:
-        return ",".join(entry.name for entry in self._inputs.values() if entry.is_unmatched)
-
-    def _match(self) -> None:
-        for match in self._matchers:
-            if text := match():
-                self.get_logger().warning(text)
 
     def _make_ready(self) -> None:
         self.set_state(NodeState.WARMING)
