@@ -6,7 +6,7 @@
 Times mean something on an idle machine only. ``--bag`` is a directory with ``bag``, ``calibration.yaml`` and, for the errors,
 ``truth.tum``.
 
-latency   the bag at its own pace: what is lost, time from a long frame's publication to its pose, errors against `vli run`
+latency   the bag at its own pace: what is lost, time from when a long frame was due to its pose, errors against `vli run`
 rate      the highest pace without a loss
 overhead  processor time of each node beyond that of its stage: transport, executor, copies; the driver's stage is reading the bag
 kill      each node killed (SIGKILL) five times: time until it works again in the graph, the others alive
@@ -17,6 +17,9 @@ stop      all nodes started and stopped, SIGINT and SIGTERM in turn, at random m
 from __future__ import annotations
 
 import argparse
+import contextlib
+import io
+import json
 import os
 import random
 import signal
@@ -27,10 +30,12 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from graph_bench import NODES, Graph, Recording, graph, resident_mb, rmse_mm, run_offline
+from graph_bench import NODES, Graph, Meter, Recording, graph, resident_mb, rmse_mm, run_offline
 
+from vli_bringup.cli import main as vli
 from vli_bringup.graph import describe_graph
 from vli_bringup.processes import GraphError
 from vli_bringup.tum import read_tum
@@ -79,17 +84,26 @@ class Bench:
         """Return the graph over the recording, see :func:`graph_bench.graph`."""
         return graph(self.recording, self.directory, rate, self.options.duration, own)
 
+    def replay(self, rate: float = 1.0) -> tuple[dict[str, Any], Path]:
+        """Return the summary and the results of ``vli replay``: what a user gets, without anyone else who listens."""
+        results = self.directory / "replay"
+        command = ["replay", str(self.recording.bag), "--calib", str(self.recording.calibration_path), "--out", str(results)]
+        command += ["--overwrite", "--rate", str(rate)]
+        command += ["--duration", str(self.options.duration)] if self.options.duration else []
+        with contextlib.redirect_stdout(io.StringIO()):
+            vli(command)
+        return json.loads((results / "summary.json").read_text()), results
+
     def latency(self) -> None:
         """Losses, latency, and errors against those of the offline run."""
-        with self.graph() as run:
-            run.play()
-            losses, latencies = run.listener.losses(), run.meter.latencies_ms()
-        self.table.add("drops at rate 1", "0", _losses(losses))
-        self.table.add("long frame → pose, p50 / p99", "≤ 40 / 120 ms", _percentiles(latencies))
+        summary, results = self.replay()
+        self.table.add("drops at rate 1", "0", _losses(summary["drops"]))
+        both = f"{summary['latency_ms_p50']:.0f} / {summary['latency_ms_p99']:.0f} ms ({summary['frames_long']} frames)"
+        self.table.add("long frame due → pose, p50 / p99", "≤ 40 / 120 ms", both)
         truth = self.recording.directory / "truth.tum"
-        if truth.exists() and run.recorder.live:
-            online = rmse_mm(run.recorder, read_tum(truth))
-            offline = rmse_mm(run_offline(self.recording, self.options.duration).recorder, read_tum(truth))
+        if truth.exists():
+            online = rmse_mm(read_tum(results / "trajectory.tum"), read_tum(truth))
+            offline = rmse_mm(run_offline(self.recording, self.options.duration).live(), read_tum(truth))
             bar = f"≤ {1.3 * offline + 0.02:.3f} mm"
             self.table.add("trajectory RMSE, graph (offline)", bar, f"{online:.3f} mm ({offline:.3f} mm)")
 
@@ -97,10 +111,7 @@ class Bench:
         """The highest pace without losses, and what is lost first beyond it."""
         best, beyond = 0.0, ""
         for rate in RATES:
-            with self.graph(rate) as run:
-                run.play()
-                losses = run.listener.losses()
-            if losses:
+            if losses := self.replay(rate)[0]["drops"]:
                 beyond = f"; at {rate:g} lost: {_losses(losses)}"
                 break
             best = rate
@@ -148,12 +159,13 @@ class Bench:
         memory: list[tuple[float, dict[str, float]]] = []
         with self.graph(loop=True) as run:
             run.wait_for_frames()
+            meter = Meter(run.listener)
             pids, begin_s = run.processes.pids, time.monotonic()
             while (now_s := time.monotonic()) < begin_s + 60.0 * minutes:
                 memory.append((now_s - begin_s, {name: resident_mb(pid) for name, pid in pids.items()}))
                 run.wait(lambda until_s=now_s + 2.0: time.monotonic() > until_s)  # type: ignore[misc]
             half_s = begin_s + 30.0 * minutes
-            whole, second = run.meter.latencies_ms(), run.meter.latencies_ms(half_s)
+            whole, second = meter.latencies_ms(), meter.latencies_ms(half_s)
             losses, restarts = run.listener.losses(), run.processes.restarts
         first = whole[: len(whole) - len(second)]
         for name in NODES:
@@ -227,13 +239,6 @@ def _losses(losses: dict[str, int]) -> str:
 
 def _p99(latencies: FloatArray) -> float:
     return float(np.percentile(latencies, 99)) if len(latencies) else float("nan")
-
-
-def _percentiles(latencies: FloatArray) -> str:
-    if not len(latencies):
-        return "no pose"
-    p50, p99 = np.percentile(latencies, [50, 99])
-    return f"{p50:.0f} / {p99:.0f} ms ({len(latencies)} frames)"
 
 
 SECTIONS: dict[str, Callable[[Bench], None]] = {

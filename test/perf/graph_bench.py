@@ -98,7 +98,6 @@ class Graph:
     processes: NodeProcesses
     listener: GraphListener
     recorder: Recorder
-    meter: Meter
 
     def wait(self, condition: Callable[[], bool], timeout_s: float = _START_S) -> float:
         """Spin until a condition holds; return the seconds that took.
@@ -170,7 +169,7 @@ def graph(
         NodeProcesses([_own(node, own or {}) for node in nodes], parameter_file) as processes,
         GraphListener(recorder) as listener,
     ):
-        yield Graph(processes, listener, recorder, Meter(listener))
+        yield Graph(processes, listener, recorder)
 
 
 def _own(node: NodeDescription, driver: Mapping[str, Any]) -> NodeDescription:
@@ -191,6 +190,11 @@ class Offline:
 
     recorder: Recorder
     cpu_s: dict[str, float] = field(default_factory=dict)
+
+    def live(self) -> Trajectory:
+        """Return the poses as they were published."""
+        stamps = sorted(self.recorder.live)
+        return Trajectory(np.array(stamps, np.int64), np.stack([self.recorder.live[stamp] for stamp in stamps]))
 
 
 class _Timed:
@@ -257,9 +261,6 @@ def run_offline(recording: Recording, duration_s: float | None = None) -> Offlin
     return result
 
 
-def rmse_mm(recorder: Recorder, truth: Trajectory) -> float:
-    """Return the translation RMSE of the live trajectory."""
-    live = Trajectory(
-        np.array(sorted(recorder.live), np.int64), np.stack([recorder.live[stamp] for stamp in sorted(recorder.live)])
-    )
+def rmse_mm(live: Trajectory, truth: Trajectory) -> float:
+    """Return the translation RMSE of a trajectory."""
     return 1e3 * rms(np.linalg.norm(trajectory_errors(associate(live, truth), np.eye(4)).translation, axis=1))
