@@ -15,6 +15,9 @@ from vli_bringup.listener import GraphListener
 from vli_bringup.recorder import Recorder
 from vli_common.calibration import load_calibration
 
+_UNKNOWN = "_NODE_NAMESPACE_UNKNOWN_"
+"""What ROS says of an end whose node it has not heard of yet."""
+
 pytestmark = pytest.mark.graph
 
 
@@ -43,7 +46,13 @@ def test_scanners_in_namespaces_of_their_own_share_nothing_but_diagnostics(
                     found[topic] = {end.node_namespace for end in ends} - {node.get_namespace()}
                 return found
 
-            wait(listener, lambda: wanted <= set(topics()) and {"/left", "/right"} <= topics()["/diagnostics"])
+            def is_known() -> bool:
+                """Return whether all are there, and the name of everyone who is: an end is heard of before its node."""
+                found = topics()
+                named = all(topic in found and _UNKNOWN not in found[topic] for topic in wanted)
+                return named and {"/left", "/right"} <= found.get("/diagnostics", set())
+
+            wait(listener, is_known)
             shared = {topic for topic, spaces in topics().items() if {"/left", "/right"} <= spaces}
             assert shared - {"/rosout", "/parameter_events"} == {"/diagnostics"}
             assert topics()["/left/imu"] == {"/left"}
