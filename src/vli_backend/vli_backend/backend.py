@@ -147,7 +147,7 @@ class BackEnd:
             return self._track(frame, self._estimator)
         except _SOLVER_ERRORS as error:
             self.counters.add("solver_failures")
-            return self._recover(stamp, str(error))
+            return self._recover(frame, str(error))
 
     def flush(self) -> WindowPoses | None:
         """Return everything still in the window as final (end of input, pause, reset)."""
@@ -225,9 +225,9 @@ class BackEnd:
         window = self._end_window(TrackingState.LOST, reason)
         return BackEndOutput(stamp_ns, self.state, reason, window=window)
 
-    def _recover(self, stamp_ns: int, problem: str) -> BackEndOutput:
+    def _recover(self, frame: FrontEndOutput, problem: str) -> BackEndOutput:
         """After a solver's failure go on with a new window from the newest keyframe; LOST where that fails again at once."""
-        estimator = self._estimator
+        estimator, stamp_ns = self._estimator, frame.tracks.stamp_ns
         if estimator is None or stamp_ns - self._last_failure_ns < _RECOVERY_NS:
             return self._lose(stamp_ns, f"solver failed: {problem}")
         self._last_failure_ns = stamp_ns
@@ -241,12 +241,13 @@ class BackEnd:
         try:
             self._estimator = WindowEstimator(self._calibration, config, tracks, state, prior, estimator.scans, depths)
             self._estimator.adopt(estimator.landmarks)
+            begins = tracks.stamp_ns == stamp_ns
+            found = self._estimator.current(stamp_ns, self.session) if begins else self._estimator.add_frame(frame, self.session)
         except _SOLVER_ERRORS as error:
             return self._lose(stamp_ns, f"solver failed: {error}")
         self.counters.add("windows_renewed")
         self.state, self.reason = TrackingState.DEGRADED, f"solver failed, the window begins anew: {problem}"
-        pose = self._estimator.current(stamp_ns, self.session).pose
-        return self._output(stamp_ns, FrameResult(pose, 0, window))
+        return self._output(stamp_ns, FrameResult(found.pose, found.landmarks, window))
 
     def _end_window(self, state: TrackingState, reason: str) -> WindowPoses | None:
         estimator = self._estimator

@@ -87,6 +87,9 @@ class WindowEstimator:
         self._moving_keyframes = 0
         self._T_map_odom = np.eye(4)
         self.constraints: MapConstraints | None = None
+        """For the next solve."""
+        self._map: MapConstraints | None = None
+        """Of the newest solve: its marginalisation takes the same, whatever has come since."""
         self.plane_residuals: PlaneResiduals | None = None
         """Laser depths of the landmarks that left last, compared with vision."""
 
@@ -111,7 +114,7 @@ class WindowEstimator:
 
     @property
     def restart(self) -> tuple[Tracks, KeyframeState]:
-        """Tracks of the newest keyframe and its state before it was solved: what is left when the solver fails on it."""
+        """Tracks of the newest keyframe and its state, as guessed where the solver fails on it: where a new window begins."""
         return self._candidate
 
     @property
@@ -162,7 +165,11 @@ class WindowEstimator:
         )
 
     def add_frame(self, frame: FrontEndOutput, session: int) -> FrameResult:
-        """Return the pose of one long frame; at a keyframe, solve the window."""
+        """Return the pose of one long frame; at a keyframe, solve the window.
+
+        The oldest keyframe of a full window is marginalised with the frame after the solve: no frame has to do both.
+        """
+        self._make_room()
         tracks, imu = frame.tracks, self._usable(frame.preintegration)
         inflate = frame.preintegration.inflate if frame.preintegration is not None else 1.0
         predicted = self._predictor.predict(tracks.stamp_ns, imu, tracks.stationary, inflate)
@@ -202,6 +209,10 @@ class WindowEstimator:
     def flush(self, session: int) -> WindowPoses | None:
         """Return all frames as final, those after the newest keyframe included."""
         poses = self._keyframe_poses()
+        if self._is_full:
+            # Its last word has been said, and a solver that has failed is not asked again.
+            self._window.drop_oldest()
+            poses = poses[1:]
         if len(self._records) > 1:
             interval = close_interval(self._records, self._scans)
             last = self._records[-1]
@@ -261,11 +272,12 @@ class WindowEstimator:
         self._moving_keyframes += int(moving)
         first_ones = moving and self._moving_keyframes <= self._config.start_keyframes
         self._solve(self._config.start_iterations if first_ones else self._config.iterations)
+        self._candidate = tracks, self._state
         self._predictor.set_keyframe(tracks.stamp_ns, self._state)
         T = self._state.T_map_imu
         self._records = [FrameRecord(tracks.stamp_ns, T @ self._T_imu_cam, tracks.stationary)]
         self._T_map_odom = T @ inverse(T_odom_imu)
-        window = self._leave(session)
+        window = self._window.poses(self._keyframe_poses(), int(self._is_full), session)
         self._covariance.set_keyframe(tracks.stamp_ns, T, self._smoother.newest_covariance(), self._on_map)
         pose = self._estimate(
             tracks.stamp_ns, self._records[0].T_map_camera, self._state.velocity, self._covariance.of_keyframe(), session
@@ -306,6 +318,7 @@ class WindowEstimator:
     def _solve(self, iterations: int) -> None:
         """Find depths, then poses, velocities and biases of the window."""
         self._measure_depths()
+        self._map = self.constraints
         self._smoother.solve(self._condenser(self._landmarks.usable, range(len(self._window.intervals))), iterations)
         self._state = self._smoother.states()[-1]
         jump = self._jump(self._records[-1].T_map_camera, self._state.T_map_imu @ self._T_imu_cam)
@@ -322,9 +335,9 @@ class WindowEstimator:
             poses = T_map_imu @ self._T_imu_cam
             self._refine(poses, use)
             quadratic = condense(self._landmarks.arrays, poses, use, self._config.cauchy)
-            if self.constraints is not None and len(self.constraints) and len(map_intervals):
+            if self._map is not None and len(self._map) and len(map_intervals):
                 quadratic = quadratic + condense_map(
-                    self.constraints,
+                    self._map,
                     self._window.stamps,
                     self._window.intervals,
                     map_intervals,
@@ -340,25 +353,25 @@ class WindowEstimator:
         information = refine(self._landmarks.arrays, poses, use, self._config.cauchy, self._limits)
         self._landmarks.information[use] = information[use]
 
-    def _leave(self, session: int) -> WindowPoses:
-        """Marginalise the oldest keyframe if the window is full; return the poses of all frames."""
+    @property
+    def _is_full(self) -> bool:
+        return len(self._window) > self._config.window_keyframes
+
+    def _make_room(self) -> None:
+        """Marginalise the oldest keyframe if the window is full; what it said of its frames was their last word."""
+        if not self._is_full:
+            return
         poses = self._keyframe_poses()
-        full = len(self._window) > self._config.window_keyframes
-        message = self._window.poses(poses, int(full), session)
-        if full:
-            oldest_rows = self._landmarks.arrays.anchor == 0
-            self.plane_residuals = plane_residuals(self._landmarks, oldest_rows, poses, self._config.cauchy, self._limits)
-            leaving = self._landmarks.split()
-            stays = self._landmarks.usable & ~leaving
-            # What the map says of the oldest interval leaves with it; the rest goes on holding the window.
-            oldest, rest = range(1), range(1, len(self._window.intervals))
-            self._smoother.marginalise_oldest(
-                self._condenser(self._landmarks.usable & leaving, oldest), self._condenser(stays, rest)
-            )
-            self._landmarks.drop_oldest(leaving)
-            self._window.drop_oldest()
-            self._points = self._landmarks.points(self._keyframe_poses())
-        return message
+        oldest_rows = self._landmarks.arrays.anchor == 0
+        self.plane_residuals = plane_residuals(self._landmarks, oldest_rows, poses, self._config.cauchy, self._limits)
+        leaving = self._landmarks.split()
+        stays = self._landmarks.usable & ~leaving
+        # What the map says of the oldest interval leaves with it; the rest goes on holding the window.
+        oldest, rest = range(1), range(1, len(self._window.intervals))
+        self._smoother.marginalise_oldest(self._condenser(self._landmarks.usable & leaving, oldest), self._condenser(stays, rest))
+        self._landmarks.drop_oldest(leaving)
+        self._window.drop_oldest()
+        self._points = self._landmarks.points(self._keyframe_poses())
 
     def _measure_depths(self) -> None:
         """Give the features of the two newest keyframes their laser depth, eq. (2): the newest lacks the scans after it."""
@@ -373,8 +386,7 @@ class WindowEstimator:
     @property
     def _on_map(self) -> bool:
         """Whether map constraints on scans of the window took part in the newest solve."""
-        constraints = self.constraints
-        return constraints is not None and bool((constraints.scan_stamps > self._window.stamps[0]).any())
+        return self._map is not None and bool((self._map.scan_stamps > self._window.stamps[int(self._is_full)]).any())
 
     # -- views -------------------------------------------------------------------------------------------------------------
 

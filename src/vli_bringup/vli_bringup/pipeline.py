@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 from vli_backend.backend import BackEnd
 from vli_bringup.camera_thread import CameraThread, SortedImage
+from vli_bringup.mapping_thread import MappingThread
 from vli_bringup.settings import Settings
 from vli_bringup.timing import FrameTimer
 from vli_common.calibration import Calibration
@@ -31,7 +32,7 @@ from vli_frontend.frontend import FrontEnd
 from vli_mapping.mapper import Mapper
 
 Event = BackEndOutput | WindowPoses | MappingOutput
-"""What a push may bring, in this order for each long frame."""
+"""What a push may bring: pose, then window; what the map makes of a window comes before the pose of the next keyframe."""
 
 
 @dataclass
@@ -63,7 +64,7 @@ class Pipeline:
     and the bias of one keyframe enters the preintegration after it.
 
     An image is worked on when the one after it has come, so that the camera's thread has the time between for decoding and
-    triangulation; order and results are those of one thread.
+    triangulation; the mapping's has the time from one keyframe to the next. Order and results are those of one thread.
 
     Args:
         stages: see :meth:`Stages.create`.
@@ -78,6 +79,7 @@ class Pipeline:
         self._mode = mode
         self._clock = ClockMonitor()
         self._camera = CameraThread(stages.demultiplexer, stages.scanner)
+        self._mapping = MappingThread(stages.mapper, self.timer)
         self._queue: deque[Future[list[SortedImage]] | ImuSample] = deque()
 
     @property
@@ -102,10 +104,10 @@ class Pipeline:
     def flush(self) -> list[Event]:
         """Return what is still held back: images without a verdict, then the window, as final."""
         self._queue.append(self._camera.flush())
-        events = self._drain()
-        with self.timer.measure("backend"):
+        events = [*self._drain(), *self._hear_map()]
+        with self.timer.charge("backend"):
             window = self.stages.back_end.flush()
-        events += self._map(window)
+        events += [*self._map(window), *self._hear_map()]
         self.timer.lap()
         return events
 
@@ -137,7 +139,7 @@ class Pipeline:
         if not self._mode.uses_imu:
             return
         self._counters.add("imu_samples")
-        with self.timer.measure("frontend"):
+        with self.timer.charge("frontend"):
             frames = self.stages.front_end.add_imu(sample)
         yield from self._estimate(frames)
 
@@ -147,9 +149,8 @@ class Pipeline:
         if item.exposure is Exposure.SHORT:
             self._add_scan(item.scan)
             return
-        with self.timer.measure("mapping"):
-            self.stages.mapper.add_image(item.image)
-        with self.timer.measure("frontend"):
+        self._mapping.add_image(item.image)
+        with self.timer.charge("frontend"):
             frames = self.stages.front_end.add_image(item.image)
         yield from self._estimate(frames)
 
@@ -157,16 +158,17 @@ class Pipeline:
         """Give the stripe of a short frame to all who use it."""
         if scan is None:
             return
-        with self.timer.measure("frontend"):
+        with self.timer.charge("frontend"):
             self.stages.front_end.add_scan(scan)
-        with self.timer.measure("backend"):
+        with self.timer.charge("backend"):
             self.stages.back_end.add_scan(scan)
-        with self.timer.measure("mapping"):
-            self.stages.mapper.add_scan(scan)
+        self._mapping.add_scan(scan)
 
     def _estimate(self, frames: list[FrontEndOutput]) -> Iterator[Event]:
         for frame in frames:
-            with self.timer.measure("backend"):
+            if frame.tracks.keyframe:
+                yield from self._hear_map()
+            with self.timer.charge("backend"):
                 output = self.stages.back_end.add_frame(frame)
             yield output
             if output.pose is not None:
@@ -179,10 +181,13 @@ class Pipeline:
         if window is None:
             return
         yield window
-        with self.timer.measure("mapping"):
-            update = self.stages.mapper.add_window(window)
-        if update.relocalisation is not None:
-            self.stages.back_end.relocalise(update.relocalisation)
-        if update.constraints is not None:
-            self.stages.back_end.add_constraints(update.constraints)
-        yield update
+        self._mapping.add_window(window)
+
+    def _hear_map(self) -> Iterator[Event]:
+        """Wait for what the map makes of the windows so far, and tell the back end."""
+        for update in self._mapping.wait():
+            if update.relocalisation is not None:
+                self.stages.back_end.relocalise(update.relocalisation)
+            if update.constraints is not None:
+                self.stages.back_end.add_constraints(update.constraints)
+            yield update

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +21,9 @@ _TOTAL = "total"
 class FrameTimer:
     """Attributes time to long frames: a frame's own, its short frame's and its IMU samples', until the next long frame.
 
-    A stage's column is the time of the thread that did its work. ``total`` is wall time, from the moment that a frame's bytes are
-    taken until all that it and its short frame bring is done, waiting for the camera's thread included; as two threads share the
-    work, it is less than the sum of the stages.
+    A stage's column is the time of the thread that did its work. ``total`` is wall time of the pipeline, from the moment that a
+    frame's turn comes until the next one's does, waiting for other threads included: the totals of all frames add up to the run's
+    wall time. As three threads share the work, it is less than the sum of the stages.
     """
 
     def __init__(self) -> None:
@@ -42,12 +42,9 @@ class FrameTimer:
         self._current[_TOTAL] += now_s - self._mark_s
         self._mark_s = now_s
 
-    @contextmanager
-    def measure(self, stage: str) -> Iterator[None]:
-        """Add the time of the block to the frame at hand."""
-        start_s = time.perf_counter()
-        yield
-        self._current[stage] += time.perf_counter() - start_s
+    def charge(self, stage: str) -> AbstractContextManager[None]:
+        """Return what adds the time of a block, in whatever thread, to the frame that is at hand now; one thread a stage."""
+        return _charge(self._current, stage)
 
     def sorted_in(self, stamp_ns: int, is_long: bool, costs: Mapping[str, float]) -> None:
         """Say what an image is and what it has cost so far; a long one is the frame at hand from now on.
@@ -83,6 +80,13 @@ class FrameTimer:
             "ms_per_frame_mean": round(float(total.mean()), 3),
             "ms_per_frame_p95": round(float(np.percentile(total, 95)), 3),
         }
+
+
+@contextmanager
+def _charge(costs: _Costs, stage: str) -> Iterator[None]:
+    start_s = time.perf_counter()
+    yield
+    costs[stage] += time.perf_counter() - start_s
 
 
 def _no_costs() -> _Costs:

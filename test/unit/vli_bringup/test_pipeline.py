@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -33,6 +34,12 @@ class Log(list):
 
     def of(self, *methods):
         return [(method, stamp) for _, method, stamp in self if method in methods]
+
+    def in_main_thread(self):
+        return [call for call in self if call[0] != "map"]
+
+    def in_mapping_thread(self):
+        return [call for call in self if call[0] == "map"]
 
 
 class FakeDemultiplexer:
@@ -87,7 +94,7 @@ class FakeFrontEnd:
     def _answer(self, until_ns=None):
         ready = [image for image in self.waiting if until_ns is None or image.stamp_ns < until_ns]
         self.waiting = [image for image in self.waiting if image not in ready]
-        return [FrontEndOutput(image, None) for image in ready]
+        return [FrontEndOutput(SimpleNamespace(stamp_ns=image.stamp_ns, keyframe=True), None) for image in ready]
 
 
 class FakeBackEnd:
@@ -176,8 +183,9 @@ def test_long_frames_go_to_front_end_and_map_and_short_ones_as_scans_to_all(pipe
 
 def test_constraints_of_one_keyframe_come_before_the_solve_of_the_next(pipeline, log):
     play(pipeline)
-    calls = [(method, stamp // MS) for method, stamp in log.of("frame", "window", "constraints")]
-    assert calls == [(method, stamp) for stamp in (1000, 1032, 1064) for method in ("frame", "window", "constraints")]
+    pipeline.flush()
+    calls = [(method, stamp // MS) for method, stamp in log.of("frame", "constraints")]
+    assert calls[:6] == [(method, stamp) for stamp in (1000, 1032, 1064) for method in ("frame", "constraints")]
 
 
 def test_the_bias_of_a_keyframe_reaches_the_front_end_before_its_next_frame(pipeline, log):
@@ -186,39 +194,41 @@ def test_the_bias_of_a_keyframe_reaches_the_front_end_before_its_next_frame(pipe
 
 
 def test_events_come_in_the_order_pose_window_map(pipeline):
-    events = play(pipeline)
-    assert [type(event) for event in events] == [BackEndOutput, WindowPoses, MappingOutput] * 3
+    events = [*play(pipeline), *pipeline.flush()]
+    assert [type(event) for event in events] == [BackEndOutput, WindowPoses, MappingOutput] * 3 + [WindowPoses, MappingOutput]
 
 
 def test_the_end_of_input_releases_held_images_and_flushes_the_window_into_the_map(pipeline, log):
     play(pipeline)
-    held = len(log)
+    held = len(log.in_main_thread())
     events = pipeline.flush()
-    later = [method for _, method, _ in log[held:] if method != "imu"]
-    assert later == ["scan", "scan", "scan", "image", "image", "flush", "window", "constraints"]
+    later = [method for _, method, _ in log.in_main_thread()[held:] if method != "imu"]
+    assert later == ["scan", "scan", "image", "constraints", "flush", "constraints"]
+    assert [method for _, method, _ in log.in_mapping_thread()[-4:]] == ["window", "scan", "image", "window"]
     assert isinstance(events[-2], WindowPoses)
 
 
 def test_what_comes_out_does_not_depend_on_which_thread_is_faster(log, monkeypatch):
     runs = []
-    for slow in (FakeScanner, FakeFrontEnd):
+    for slow, method in ((FakeScanner, "scan"), (FakeFrontEnd, "add_image"), (FakeMapper, "add_window")):
         delayed = Log()
         stages = Stages(FakeDemultiplexer(), FakeScanner(), FakeFrontEnd(delayed), FakeBackEnd(delayed), FakeMapper(delayed))
-        method = "scan" if slow is FakeScanner else "add_image"
         original = getattr(slow, method)
         with monkeypatch.context() as patch:
             patch.setattr(slow, method, lambda self, item, original=original: (time.sleep(0.01), original(self, item))[1])
-            play(Pipeline(stages, Mode.VLI_SLAM))
-        runs.append(list(delayed))
-    assert runs[0] == runs[1]
+            slowed = Pipeline(stages, Mode.VLI_SLAM)
+            play(slowed)
+            slowed.flush()
+        runs.append((delayed.in_main_thread(), delayed.in_mapping_thread()))
+    assert runs[0] == runs[1] == runs[2]
 
 
 def test_a_clock_jump_finishes_the_old_session_and_starts_all_stages_anew(pipeline, log):
     play(pipeline, start=100_000)
-    before = len(log)
+    before = len(log.in_main_thread())
     play(pipeline, start=1000)
-    later = [call for call in log[before:] if call[1] in ("flush", "window", "reset", "frame")]
-    assert [method for _, method, _ in later[:4]] == ["flush", "window", "reset", "reset"]
+    later = [call for call in log.in_main_thread()[before:] if call[1] in ("flush", "constraints", "reset", "frame")]
+    assert [method for _, method, _ in later[:5]] == ["constraints", "flush", "constraints", "reset", "reset"]
     assert (
         pipeline.stages.back_end.reason == "the clock of the IMU jumped by -98.9 s"
         or "jumped by -" in pipeline.stages.back_end.reason

@@ -31,7 +31,7 @@ def test_a_short_frame_and_the_imu_count_to_the_long_frame_before(spend):
     timer = FrameTimer()
     for stamp, is_long, decoding in ((10, True, 5), (20, False, 3), (30, True, 7)):
         timer.sorted_in(stamp, is_long, {"decode": 1e-3 * decoding})
-        with timer.measure("frontend"):
+        with timer.charge("frontend"):
             spend(1)
     np.testing.assert_allclose(column(timer, "decode"), [8, 7])
     np.testing.assert_allclose(column(timer, "frontend"), [2, 1])
@@ -53,7 +53,7 @@ def test_wall_time_is_counted_once_where_two_threads_work(spend):
     timer = FrameTimer()
     timer.start()
     timer.sorted_in(10, True, {"decode": 4e-3, "stripe": 1e-3})
-    with timer.measure("frontend"):
+    with timer.charge("frontend"):
         spend(6)
     timer.lap()
     assert timer.summary() == {"ms_per_frame_mean": pytest.approx(6), "ms_per_frame_p95": pytest.approx(6)}
@@ -62,7 +62,7 @@ def test_wall_time_is_counted_once_where_two_threads_work(spend):
 def test_what_comes_before_the_first_long_frame_counts_to_it(spend):
     timer = FrameTimer()
     timer.start()
-    with timer.measure("frontend"):
+    with timer.charge("frontend"):
         spend(4)
     timer.lap()
     timer.sorted_in(10, True, {})
@@ -73,9 +73,9 @@ def test_the_file_has_a_row_a_frame_and_its_stamp_to_the_nanosecond(spend, tmp_p
     timer = FrameTimer()
     timer.start()
     timer.sorted_in(1_700_000_000_123_456_789, True, {})
-    with timer.measure("backend"):
+    with timer.charge("backend"):
         spend(2)
-    with timer.measure("mapping"):
+    with timer.charge("mapping"):
         spend(1)
     timer.lap()
     timer.write(tmp_path / "timing.csv")
