@@ -31,6 +31,9 @@ from vli_driver.scanner import StripeScanner
 from vli_frontend.frontend import FrontEnd
 from vli_mapping.mapper import Mapper
 
+_AHEAD = 4
+"""Images that the camera's thread may be ahead: a keyframe takes as long as it takes for two long frames and their short ones."""
+
 Event = BackEndOutput | WindowPoses | MappingOutput
 """What a push may bring: pose, then window; what the map makes of a window comes before the pose of the next keyframe."""
 
@@ -63,8 +66,8 @@ class Pipeline:
     The two loops are those of the graph: constraints found with the window of one keyframe enter the solve of the next, eq. (4),
     and the bias of one keyframe enters the preintegration after it.
 
-    An image is worked on when the one after it has come, so that the camera's thread has the time between for decoding and
-    triangulation; the mapping's has the time from one keyframe to the next. Order and results are those of one thread.
+    An image is worked on when the four after it have come, so that the camera's thread can decode and triangulate ahead while a
+    keyframe is solved; the mapping's has the time from one keyframe to the next. Order and results are those of one thread.
 
     Args:
         stages: see :meth:`Stages.create`.
@@ -81,6 +84,7 @@ class Pipeline:
         self._camera = CameraThread(stages.demultiplexer, stages.scanner)
         self._mapping = MappingThread(stages.mapper, self.timer)
         self._queue: deque[Future[list[SortedImage]] | ImuSample] = deque()
+        self._images_waiting = 0
 
     @property
     def counters(self) -> Counters:
@@ -96,15 +100,13 @@ class Pipeline:
         if isinstance(item, ImuSample):
             self._queue.append(item)
             return events
-        sorted_images = self._camera.push(item, self.session)
-        events += self._drain()
-        self._queue.append(sorted_images)
-        return events
+        self._enqueue(self._camera.push(item, self.session))
+        return events + self._drain(_AHEAD)
 
     def flush(self) -> list[Event]:
         """Return what is still held back: images without a verdict, then the window, as final."""
-        self._queue.append(self._camera.flush())
-        events = [*self._drain(), *self._hear_map()]
+        self._enqueue(self._camera.flush())
+        events = [*self._drain(0), *self._hear_map()]
         with self.timer.charge("backend"):
             window = self.stages.back_end.flush()
         events += [*self._map(window), *self._hear_map()]
@@ -120,15 +122,21 @@ class Pipeline:
         self.stages.back_end.reset(self.session, reason)
         return events
 
-    def _drain(self) -> list[Event]:
-        """Work off what has been taken so far."""
+    def _enqueue(self, images: Future[list[SortedImage]]) -> None:
+        self._queue.append(images)
+        self._images_waiting += 1
+
+    def _drain(self, ahead: int) -> list[Event]:
+        """Work off what has been taken so far, in order, until only ``ahead`` images wait; with none, all of it."""
         self.timer.start()
         events: list[Event] = []
-        while self._queue:
+        while self._images_waiting > ahead or (not ahead and self._queue):
             item = self._queue.popleft()
             if isinstance(item, ImuSample):
                 events += self._push_imu(item)
                 continue
+            self._images_waiting -= 1
+            self.timer.lap()
             for sorted_image in item.result():
                 events += self._push_image(sorted_image)
                 self.timer.lap()

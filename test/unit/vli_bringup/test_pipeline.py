@@ -164,21 +164,21 @@ def imu(milliseconds):
 
 
 def play(pipeline, images=7, start=1000):
-    """Push a 60 Hz camera and a 200 Hz IMU in log order; return the events. The last image only pushes out those before."""
+    """Push a 60 Hz camera and a 200 Hz IMU in log order; return the events. The last four images only push out those before."""
     items = [image(start + 16 * index) for index in range(images)] + [imu(start + 5 * index) for index in range(4 * images)]
     return [event for item in sorted(items, key=lambda item: item.stamp_ns) for event in pipeline.push(item)]
 
 
 def test_long_frames_go_to_front_end_and_map_and_short_ones_as_scans_to_all(pipeline, log):
     play(pipeline)
-    assert [stamp // MS for _, stamp in log.of("image")] == [1000, 1000, 1032, 1032, 1064, 1064]
-    assert [(stage, stamp // MS) for stage, method, stamp in log if method == "scan"][:3] == [
-        ("front", 1016),
-        ("back", 1016),
-        ("map", 1016),
-    ]
-    assert pipeline.counters["long_images"] == 3
-    assert pipeline.counters["short_images"] == 2
+    pipeline.flush()
+    for calls, stages in ((log.in_main_thread(), ("front", "back")), (log.in_mapping_thread(), ("map",))):
+        images = [stamp // MS for _, method, stamp in calls if method == "image"]
+        assert images == [1000, 1032, 1064, 1096]
+        scans = [(stage, stamp // MS) for stage, method, stamp in calls if method == "scan"]
+        assert scans == [(stage, stamp) for stamp in (1016, 1048, 1080) for stage in stages]
+    assert pipeline.counters["long_images"] == 4
+    assert pipeline.counters["short_images"] == 3
 
 
 def test_constraints_of_one_keyframe_come_before_the_solve_of_the_next(pipeline, log):
@@ -190,6 +190,7 @@ def test_constraints_of_one_keyframe_come_before_the_solve_of_the_next(pipeline,
 
 def test_the_bias_of_a_keyframe_reaches_the_front_end_before_its_next_frame(pipeline, log):
     play(pipeline)
+    pipeline.flush()
     assert [method for method, _ in log.of("frame", "bias")] == ["frame", "bias"] * 3
 
 
@@ -200,10 +201,10 @@ def test_events_come_in_the_order_pose_window_map(pipeline):
 
 def test_the_end_of_input_releases_held_images_and_flushes_the_window_into_the_map(pipeline, log):
     play(pipeline)
-    held = len(log.in_main_thread())
+    assert log.of("frame") == [("frame", 1000 * MS)]
     events = pipeline.flush()
-    later = [method for _, method, _ in log.in_main_thread()[held:] if method != "imu"]
-    assert later == ["scan", "scan", "image", "constraints", "flush", "constraints"]
+    last = [method for _, method, _ in log.in_main_thread() if method != "imu"][-6:]
+    assert last == ["scan", "scan", "image", "constraints", "flush", "constraints"]
     assert [method for _, method, _ in log.in_mapping_thread()[-4:]] == ["window", "scan", "image", "window"]
     assert isinstance(events[-2], WindowPoses)
 
@@ -225,10 +226,13 @@ def test_what_comes_out_does_not_depend_on_which_thread_is_faster(log, monkeypat
 
 def test_a_clock_jump_finishes_the_old_session_and_starts_all_stages_anew(pipeline, log):
     play(pipeline, start=100_000)
-    before = len(log.in_main_thread())
     play(pipeline, start=1000)
-    later = [call for call in log.in_main_thread()[before:] if call[1] in ("flush", "constraints", "reset", "frame")]
-    assert [method for _, method, _ in later[:5]] == ["constraints", "flush", "constraints", "reset", "reset"]
+    pipeline.flush()
+    calls = log.in_main_thread()
+    at = calls.index(("back", "reset", 1))
+    assert [method for _, method, _ in calls[at - 4 : at]] == ["constraints", "flush", "constraints", "reset"]
+    assert all(stamp >= 100_000 * MS for _, method, stamp in calls[:at] if method == "frame")
+    assert all(stamp < 100_000 * MS for _, method, stamp in calls[at:] if method == "frame")
     assert (
         pipeline.stages.back_end.reason == "the clock of the IMU jumped by -98.9 s"
         or "jumped by -" in pipeline.stages.back_end.reason
@@ -243,6 +247,7 @@ def test_images_carry_the_session_they_belong_to(pipeline, log, monkeypatch):
     monkeypatch.setattr(pipeline.stages.mapper, "add_image", lambda image: sessions.append(image.session))
     play(pipeline, start=100_000)
     play(pipeline, start=1000)
+    pipeline.flush()
     assert set(sessions) == {0, 1}
     assert sessions == sorted(sessions)
 
@@ -256,16 +261,20 @@ def test_an_image_that_cannot_be_decoded_is_dropped_and_counted(pipeline):
 
 def test_without_laser_short_frames_are_not_scanned(log):
     stages = Stages(FakeDemultiplexer(), None, FakeFrontEnd(log), FakeBackEnd(log), FakeMapper(log))
-    play(Pipeline(stages, Mode.VI))
+    pipeline = Pipeline(stages, Mode.VI)
+    play(pipeline)
+    pipeline.flush()
     assert log.of("scan") == []
     assert len(log.of("frame")) == 3
 
 
 def test_without_imu_its_samples_stay_outside(log):
     stages = Stages(FakeDemultiplexer(), FakeScanner(), FakeFrontEnd(log, uses_imu=False), FakeBackEnd(log), FakeMapper(log))
-    play(Pipeline(stages, Mode.VL))
+    pipeline = Pipeline(stages, Mode.VL)
+    play(pipeline)
+    pipeline.flush()
     assert log.of("imu") == []
-    assert len(log.of("frame")) == 3
+    assert len(log.of("frame")) == 4
 
 
 def test_every_long_frame_has_its_cost(pipeline):
