@@ -74,6 +74,8 @@ class BackEnd:
         self.session = 0
         self.state = TrackingState.INITIALISING
         self.reason = "waiting for the first frame"
+        self._lost_by = ""
+        """Why the last window was given up, until the next one has started."""
         self._estimator: WindowEstimator | None = None
         self._new_starter = starter
         self._starter = starter(calibration, config, mode)
@@ -87,7 +89,7 @@ class BackEnd:
     def reset(self, session: int, reason: str) -> None:
         """Forget everything of the old session and wait for a new start."""
         self.session = session
-        self.state, self.reason = TrackingState.INITIALISING, reason
+        self.state, self.reason, self._lost_by = TrackingState.INITIALISING, reason, ""
         self._begin_map()
 
     def relocalise(self, found: Relocalisation) -> None:
@@ -160,9 +162,9 @@ class BackEnd:
         self._reckoning.add_frame(frame)
         estimator = self._starter.add_frame(frame, self._reckoning)
         if estimator is None:
-            self.reason = self._starter.reason
+            self.reason = "; a new start: ".join(filter(None, [self._lost_by, self._starter.reason]))
             return BackEndOutput(stamp, self.state, self.reason)
-        self._estimator = estimator
+        self._estimator, self._lost_by = estimator, ""
         self.counters.add("starts")
         self._placement.guess(self._reckoning.sigma_m(stamp))
         self.state, self.reason = TrackingState.TRACKING, self._starter.reason
@@ -256,6 +258,7 @@ class BackEnd:
             window = estimator.flush(self.session)
             self._reckoning = DeadReckoning(*estimator.newest)
         self.state, self.reason = state, reason
+        self._lost_by = reason if state is TrackingState.LOST else ""
         self._wait_for_start()
         return None if window is None else self._placement.of_window(window)
 
