@@ -20,7 +20,7 @@ def test_actions_run_one_after_another_and_answer() -> None:
         running[0] -= 1
         return "done"
 
-    futures = [aside.run(action, None) for _ in range(5)]
+    futures = [aside.run(action) for _ in range(5)]
     aside.finish(5.0)
     assert [future.result() for future in futures] == ["done"] * 5
     assert most == [1]
@@ -31,7 +31,7 @@ def test_what_an_action_raises_is_its_answer() -> None:
         raise ValueError("no")
 
     aside = Aside("test")
-    future = aside.run(action, None)
+    future = aside.run(action)
     aside.finish(5.0)
     with pytest.raises(ValueError, match="no"):
         future.result()
@@ -39,7 +39,7 @@ def test_what_an_action_raises_is_its_answer() -> None:
 
 def test_an_action_that_does_not_end_is_not_waited_for() -> None:
     aside, release = Aside("test"), threading.Event()
-    aside.run(lambda: str(release.wait()), None)
+    aside.run(lambda: str(release.wait()))
     begin_s = time.monotonic()
     aside.finish(0.05)
     assert time.monotonic() - begin_s < 5.0

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from concurrent.futures import Future
+from typing import TypeVar
 
-from rclpy.executors import Executor
-from rclpy.task import Future
+T = TypeVar("T")
 
 
 class Aside:
@@ -21,9 +22,9 @@ class Aside:
         self._turn = threading.Lock()
         self._threads: list[threading.Thread] = []
 
-    def run(self, action: Callable[[], str], executor: Executor | None) -> Future:
-        """Begin an action; return what a service of ``executor`` awaits: the result of the action, or what it raised."""
-        future = Future(executor=executor)
+    def run(self, action: Callable[[], T]) -> Future[T]:
+        """Begin an action; return what will hold its result, or what it raised."""
+        future: Future[T] = Future()
 
         def work() -> None:
             with self._turn:

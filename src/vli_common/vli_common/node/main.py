@@ -7,24 +7,21 @@ import gc
 import os
 import sys
 import threading
-import time
 from collections.abc import Callable
 from typing import NoReturn
 
 import rclpy
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
 from vli_common.errors import VliError
 from vli_common.node.base import VliNode
+from vli_common.node.executor import SPINNER
 from vli_common.node.transport import set_transport_profile
 from vli_common.stop_signals import STOP, take_over
 
 _SWITCH_S = 2e-4
 """The executor asks for the interpreter for every message. At Python's default of 5 ms, 260 messages a second would take longer
 than a second while the worker computes."""
-_REST_S = 2e-3
-"""What comes in this time is taken in one round of the executor; see :func:`vli_common.node.transport.pending`."""
 _SIGNAL_S = 0.1
 """A signal is answered this late at most: the executor's wait does not end with it."""
 _TEARDOWN_S = 3.0
@@ -88,11 +85,9 @@ def _limit_teardown(code: int) -> None:
 
 
 def _spin(node: VliNode) -> None:
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
+    spinner = SPINNER(node)
     told = os.environ.get(STOP_WITH_PARENT, "")
     parent = int(told) if told.isdecimal() else None
     while not (STOP.is_set() or node.failure or node.is_shut_down or parent not in (None, os.getppid())):
-        executor.spin_once(timeout_sec=_SIGNAL_S)
-        time.sleep(_REST_S)
-    executor.shutdown(timeout_sec=0)
+        spinner.spin(_SIGNAL_S)
+    spinner.close()

@@ -6,12 +6,10 @@ import fcntl
 import importlib
 import os
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
-from rclpy.subscription import Subscription
 
 from vli_common.topics import Topic
 
@@ -67,19 +65,6 @@ def quality(topic: Topic, reading: bool = False) -> QoSProfile:
         reliability=ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if topic.transient_local else DurabilityPolicy.VOLATILE,
     )
-
-
-def pending(subscription: Subscription | None) -> Iterator[Any]:
-    """Yield the messages that wait in a subscription already, without another round through the executor.
-
-    The executor hands over one message a round, and a round of rclpy costs as much as the work on most messages: 200 IMU
-    samples a second would take a fifth of a core.
-    """
-    if subscription is None:
-        return
-    with subscription.handle:
-        while (taken := subscription.handle.take_message(subscription.msg_type, subscription.raw)) is not None:
-            yield taken[0]
 
 
 def message_type(topic: Topic) -> Any:

@@ -7,19 +7,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import Future
+from contextlib import suppress
 from functools import partial
 from typing import Any, TypeVar
 
 import rclpy
 from rclpy.clock import Clock, ClockType
+from rclpy.exceptions import InvalidHandle
 from rclpy.publisher import Publisher
 from std_srvs.srv import Trigger
 
 from vli_common.errors import VliError
 from vli_common.node.aside import Aside
+from vli_common.node.executor import SPINNER
 from vli_common.node.inputs import Input
 from vli_common.node.lifecycle import ManagedNode
-from vli_common.node.transport import message_type, pending, quality
+from vli_common.node.transport import message_type, quality
 from vli_common.node.worker import Worker
 from vli_common.topics import NAMESPACE, Topic
 from vli_common.types import Counters
@@ -91,11 +94,7 @@ class WorkingNode(ManagedNode):
             entry.count()
             self._worker.put(topic.name, partial(self._process, entry, read, handle, message, entry.last_s), most)
 
-        def callback(message: Any) -> None:
-            accept(message)
-            for further in pending(entry.subscription):
-                accept(further)
-
+        callback = SPINNER.receiver(accept, lambda: entry.subscription)
         entry.subscribe(self, callback)
         self._inputs[topic.name] = entry
         self._matchers.append(partial(entry.adapt, self, callback))
@@ -132,15 +131,13 @@ class WorkingNode(ManagedNode):
             aside: run it in a thread of its own, since it takes long: messages are taken meanwhile. One at a time.
         """
 
-        async def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-            try:
-                response.message = await self._aside.run(action, self.executor) if aside else action()
-                response.success = True
-            except Exception as error:
-                response.success, response.message = False, str(error)
-            return response
+        def answer(_: Trigger.Request, response: Trigger.Response) -> Any:
+            job = partial(_answered, response, action)
+            return self._aside.run(job) if aside else job()
 
-        self.create_service(Trigger, f"~/{name}", answer)
+        service = self.create_service(Trigger, f"~/{name}", answer)
+        if aside:
+            service.send_response = partial(_send_when_done, service.send_response)  # type: ignore[method-assign]
 
     def every(self, period_s: float, action: Callable[[], None]) -> None:
         """Run an action in the executor again and again, by the machine's own clock.
@@ -197,3 +194,27 @@ class WorkingNode(ManagedNode):
         for match in self._matchers:
             if text := match():
                 self.get_logger().warning(text)
+
+
+def _answered(response: Trigger.Response, action: Callable[[], str]) -> Trigger.Response:
+    try:
+        response.message = action()
+        response.success = True
+    except Exception as error:
+        response.success, response.message = False, str(error)
+    return response
+
+
+def _send_when_done(send: Callable[[Trigger.Response, Any], None], answer: Future[Trigger.Response], header: Any) -> None:
+    """Send what a service answers once it is there.
+
+    To await it in the callback would not do: rclpy's executor of events takes no coroutines for services, and the other one runs
+    nothing else of the node meanwhile.
+    """
+
+    def deliver(done: Future[Trigger.Response]) -> None:
+        # The node may have been stopped by then.
+        with suppress(InvalidHandle):
+            send(done.result(), header)
+
+    answer.add_done_callback(deliver)
