@@ -15,6 +15,7 @@ from vli_mapping.map_keyframes import meet
 from vli_mapping.normals import smooth_normals, stripe_normals
 from vli_mapping.point_map import PointMap, Stripe
 from vli_mapping.scan_window import PosedScan
+from vli_mapping.spatial_hash import SpatialHash
 from vli_mapping.thinning import thin
 
 
@@ -33,6 +34,7 @@ def warm_up() -> None:
         stripe, _ = contradict(point_map, stripe)
         point_map.refine_normals(np.unique(point_map.insert(stripe).clip(0)), np.zeros(3))
     c = point_map.columns
+    SpatialHash.of(points, limits.normal_radius).reserve(1 << 12, points, np.ones(64, np.bool_))
     smooth_normals(point_map.grid, c.position, c.normal, point_map.alive(), limits.normal_radius)
     scan = LaserScan(0, points, points[:, :2], sigma, sigma)
     every, normals, planarity = np.ones(64, np.bool_), np.zeros((64, 3), np.float32), np.zeros(64, np.float32)
