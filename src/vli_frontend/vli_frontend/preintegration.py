@@ -73,6 +73,8 @@ class Preintegrator:
         self._counters = counters
         self._bias, self._interval_bias = gtsam.imuBias.ConstantBias(), gtsam.imuBias.ConstantBias()
         self._from_ns: int | None = None
+        self._hole_ns: float | None = None
+        """Interval between samples that is a gap, once the interval's first frame has asked."""
 
     def set_bias(self, bias: ImuBias) -> None:
         """Use this bias from the next keyframe on."""
@@ -84,7 +86,7 @@ class Preintegrator:
         if ended is not None and self._noise.update(ended):
             self._params = combined_params(self._noise.imu, self._config)
             self._counters.add("imu_noise_changes")
-        self._from_ns, self._interval_bias = keyframe_ns, self._bias
+        self._from_ns, self._interval_bias, self._hole_ns = keyframe_ns, self._bias, None
 
     def reset(self) -> None:
         """Forget keyframe and bias: a new session begins."""
@@ -110,9 +112,13 @@ class Preintegrator:
 
     def _gaps(self, segment: ImuSegment) -> dict[int, FloatArray]:
         """Return the variances (2,) of gyroscope and accelerometer across each length of gap that the segment rests on."""
-        stamps, values = self._synchroniser.imu.newest(HISTORY, int(segment.stamps[-1]))
-        hole_ns = HOLE * period_ns(stamps)
-        longest = segment.gaps_ns[segment.gaps_ns > hole_ns]
+        newest_ns = int(segment.stamps[-1])
+        if self._hole_ns is None:
+            self._hole_ns = HOLE * period_ns(self._synchroniser.imu.newest(HISTORY, newest_ns)[0])
+        longest = segment.gaps_ns[segment.gaps_ns > self._hole_ns]
+        if not len(longest):
+            return {}
+        stamps, values = self._synchroniser.imu.newest(HISTORY, newest_ns)
         return {int(gap): self._variance + gap_variance(stamps, values, int(gap)) for gap in np.unique(longest)}
 
     def _integrate(self, segment: ImuSegment, gaps: dict[int, FloatArray]) -> gtsam.PreintegratedCombinedMeasurements:
@@ -120,8 +126,9 @@ class Preintegrator:
         measurements = gtsam.PreintegratedCombinedMeasurements(params, self._interval_bias)
         stamps_s = (segment.stamps - segment.stamps[0]) * 1e-9
         steps = np.diff(stamps_s)
-        gyro = step_means(segment.gyro, stamps_s)
-        accel = force_at_start(step_means(segment.accel, stamps_s), gyro, steps, self._interval_bias)
+        means = step_means(np.concatenate([segment.gyro, segment.accel], axis=1), stamps_s)
+        gyro = means[:, :3]
+        accel = force_at_start(means[:, 3:], gyro, steps, self._interval_bias)
         for a, w, dt, gap in zip(accel, gyro, steps.tolist(), segment.gaps_ns.tolist(), strict=True):
             if gaps:
                 # GTSAM reads the noise at each step.
@@ -153,7 +160,7 @@ def step_means(values: FloatArray, stamps_s: FloatArray) -> FloatArray:
     samples are few or a gap lies between them, or at the ends, the curvature is not known: the rule stays.
 
     Args:
-        values: (M, 3); the first and the last are interpolated, the others samples.
+        values: (M, K); the first and the last are interpolated, the others samples.
         stamps_s: (M,) ascending.
     """
     steps = np.diff(stamps_s)
@@ -164,5 +171,5 @@ def step_means(values: FloatArray, stamps_s: FloatArray) -> FloatArray:
     slopes = np.diff(values[1:-1], axis=0) / inner[:, None]
     curvature = np.diff(slopes, axis=0) / (0.5 * (inner[1:] + inner[:-1]))[:, None]
     # One for each sample, the outer ones as their neighbours; then the mean over each step.
-    at_samples = np.pad(curvature, ((2, 2), (0, 0)), mode="edge")
+    at_samples = curvature.take(np.arange(-2, len(curvature) + 2), axis=0, mode="clip")
     return means - (steps**2)[:, None] / 12.0 * 0.5 * (at_samples[1:] + at_samples[:-1])
