@@ -9,6 +9,7 @@ from pathlib import Path
 from vli_common.errors import InputError, OutputError
 from vli_common.ply import read_cloud
 from vli_common.types import PointCloud
+from vli_mapping.albedo import finished_cloud
 from vli_mapping.config import AS_SEEN, COMPENSATED
 from vli_mapping.export import CLOUD_WRITERS, write_cloud
 from vli_mapping.map_file import SUFFIX, load_map
@@ -76,4 +77,4 @@ def read_map(path: Path, colour: str | None = None) -> PointCloud:
             )
         return read_cloud(path)
     snapshot = load_map(path)
-    return restore(snapshot).cloud(light=snapshot.light, as_seen=colour == AS_SEEN)
+    return finished_cloud(restore(snapshot), snapshot.light, colour == AS_SEEN)

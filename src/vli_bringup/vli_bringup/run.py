@@ -117,15 +117,15 @@ def process(reader: BagReader, pipeline: Pipeline, sessions: Sessions, duration_
 def write(directory: Path, pipeline: Pipeline, sessions: Sessions, clock: Clock, settings: Settings) -> None:
     """Write trajectories, map, picture, times, parameters and summary."""
     sessions.recorder.write(directory)
-    points = write_map(directory, pipeline.stages.mapper)
-    write_views(directory / "cloud.png", pipeline.stages.mapper.cloud())
+    cloud = write_map(directory, pipeline.stages.mapper)
+    write_views(directory / "cloud.png", cloud)
     pipeline.timer.write(directory / "timing.csv")
     (directory / CONFIG).write_text(to_yaml(settings))
     summary = {
         "frames_long": pipeline.counters["long_images"],
         "frames_short": pipeline.counters["short_images"],
         "keyframes": sessions.keyframes,
-        "points": points,
+        "points": len(cloud),
         "states": sessions.recorder.states,
         **clock.summary(),
         **pipeline.timer.summary(),

@@ -12,6 +12,7 @@ from pathlib import Path
 from vli_bringup.pipeline import Event, Pipeline
 from vli_bringup.recorder import Recorder
 from vli_common.calibration import Calibration
+from vli_common.types import PointCloud
 from vli_mapping.map_file import SUFFIX, save_map
 from vli_mapping.mapper import Mapper
 from vli_mapping.snapshot import take
@@ -67,9 +68,9 @@ class Sessions:
         self.recorder.states, self.recorder.reason = before.states, before.reason
 
 
-def write_map(directory: Path, mapper: Mapper) -> int:
-    """Write the map as a cloud, and whole; return the number of its points."""
+def write_map(directory: Path, mapper: Mapper) -> PointCloud:
+    """Write the map as a cloud, and whole; return the cloud."""
     cloud = mapper.cloud()
     write_ply(directory / "map.ply", cloud)
     save_map(directory / f"map{SUFFIX}", take(mapper.map, mapper.light()))
-    return len(cloud)
+    return cloud

@@ -18,8 +18,8 @@ _DARKEST = 8
 _HIDING_M, _HIDING_PX = 1.0e-3, 2.0
 """A point this much nearer in the same cell of so many pixels hides another; a flank seen at 80 degrees is no deeper there."""
 _MOST_CELLS = 1 << 22
-_MIN_FACING = 0.5
-"""Cosine between normal and viewing ray of a spot that tells of the light."""
+_MIN_FACING = 0.35
+"""Cosine between normal and viewing ray of a spot that tells of the light: only where little falls is it seen what is ambient."""
 _SHARPENING = 1.0
 """Times what a 3×3 binomial takes away: demosaicing and motion blur a print about that much."""
 

@@ -10,6 +10,7 @@ import numpy as np
 from vli_common.arrays import FloatArray, IntArray
 from vli_common.calibration import Calibration
 from vli_common.types import Counters, Image, LaserScan, MappingOutput, Mode, PointCloud, WindowPoses
+from vli_mapping.albedo import finished_cloud
 from vli_mapping.association import associate
 from vli_mapping.config import AS_SEEN, MappingConfig
 from vli_mapping.contradiction import contradict
@@ -112,11 +113,11 @@ class Mapper:
         return self._whereabouts.is_known or not len(self.map)
 
     def cloud(self, max_points: int | None = None, stamp_ns: int = 0, session: int = 0) -> PointCloud:
-        """Return the map, thinned to ``max_points`` where given; colours as the config asks for."""
+        """Return the map, colours as the config asks for; thinned to ``max_points`` where given, each colour then by itself."""
         self.settle()
         light, as_seen = self.light(), self.config.colour == AS_SEEN
         if max_points is None:
-            return self.map.cloud(None, stamp_ns, session, light, as_seen)
+            return finished_cloud(self.map, light, as_seen, stamp_ns, session)
         return self.map.thinned(max_points, stamp_ns, session, light, as_seen)
 
     def light(self) -> Light | None:

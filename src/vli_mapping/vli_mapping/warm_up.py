@@ -6,11 +6,13 @@ import numpy as np
 
 from vli_common.camera import make_camera
 from vli_common.types import Counters, LaserScan
+from vli_mapping.albedo import albedo
 from vli_mapping.association import associate
 from vli_mapping.colour import colour_points
 from vli_mapping.config import AssociationConfig, EntryConfig, MapConfig
 from vli_mapping.contradiction import contradict
 from vli_mapping.entry import away_from_edges, facing, noisy, supported
+from vli_mapping.light import Light
 from vli_mapping.map_keyframes import meet
 from vli_mapping.normals import smooth_normals, stripe_normals
 from vli_mapping.point_map import PointMap, Stripe
@@ -36,6 +38,7 @@ def warm_up() -> None:
     c = point_map.columns
     SpatialHash.of(points, limits.normal_radius).reserve(1 << 12, points, np.ones(64, np.bool_))
     smooth_normals(point_map.grid, c.position, c.normal, point_map.alive(), limits.normal_radius)
+    albedo(point_map, Light(np.zeros(3), 0.0, (0.0, 0.0), 0.03))
     scan = LaserScan(0, points, points[:, :2], sigma, sigma)
     every, normals, planarity = np.ones(64, np.bool_), np.zeros((64, 3), np.float32), np.zeros(64, np.float32)
     posed = PosedScan(scan, 1000, np.eye(4), np.zeros((64, 3), np.float32), every, every, normals, planarity)

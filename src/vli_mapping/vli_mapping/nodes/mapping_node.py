@@ -25,6 +25,7 @@ from vli_common.node import VliNode, run_node
 from vli_common.status import Health
 from vli_common.topics import CLOUD, IMAGE_LONG, LASER_POINTS, MAP, MAP_CONSTRAINTS, MAP_UPDATE, RELOCALISATION, WINDOW
 from vli_common.types import Counters, Image, LaserScan, PointCloud, WindowPoses
+from vli_mapping.albedo import finished_cloud
 from vli_mapping.config import AS_SEEN, MappingConfig
 from vli_mapping.export import write_cloud
 from vli_mapping.light import Light
@@ -258,7 +259,7 @@ class MappingNode(VliNode):
     def _cloud(self, path: Path) -> PointCloud:
         as_seen = self.parameters.config(MappingConfig).colour == AS_SEEN
         snapshot = self._with_window(path)
-        return restore(snapshot).cloud(light=snapshot.light, as_seen=as_seen)
+        return finished_cloud(restore(snapshot), snapshot.light, as_seen)
 
     def _path(self, name: str) -> Path:
         return Path(getattr(self.parameters.config(StoreConfig), name)).absolute()
