@@ -11,14 +11,16 @@ import numpy as np
 import pytest
 import rclpy
 from hostile import Dice, mutated
+from rclpy.serialization import deserialize_message
 
 from vli_backend.nodes.backend_node import BackEndNode
 from vli_common import messages
 from vli_common.calibration import load_calibration
 from vli_common.errors import MessageError
 from vli_common.node import VliNode
+from vli_common.node.transport import message_type
 from vli_common.status import NodeState
-from vli_common.topics import IMAGE_RAW, IMAGE_RAW_COMPRESSED, IMU, POSE, SESSION
+from vli_common.topics import IMAGE_RAW, IMAGE_RAW_COMPRESSED, IMU, POSE, SESSION, Topic
 from vli_common.types import ImuSample
 from vli_driver.bag import BagReader
 from vli_driver.nodes.demux_node import DemuxNode
@@ -58,12 +60,15 @@ class Graph:
                 continue
             for node, read, handle in self._readers.get(topic, ()):
                 if self._random.random() < share:
-                    bad = mutated(message, Dice(self._random.bytes(48)))
-                    # Most with the stamp of the good one, or nearly all would fail at the first check.
-                    if self._random.random() < 0.9:
-                        bad.header.stamp = message.header.stamp
-                    self.hostile[topic] += self._process(node, read, handle, bad)
+                    self.hostile[topic] += self._process(node, read, handle, self._mutation(message))
                 self._process(node, read, handle, message)
+
+    def _mutation(self, message: Any) -> Any:
+        """Return a hostile copy; most with the stamp of the good one, or nearly all would fail at the first check."""
+        bad = mutated(message, Dice(self._random.bytes(48)))
+        if self._random.random() < 0.9:
+            bad.header.stamp = message.header.stamp
+        return bad
 
     @staticmethod
     def _process(node: VliNode, read: Any, handle: Any, message: Any) -> bool:
@@ -90,13 +95,18 @@ class Graph:
             node = kind()
         for topic, read, handle in readers:
             self._readers.setdefault(topic.name, []).append((node, read, handle))
-        node.send = lambda topic, message: self._sent.append((topic.name, message))
+        node.send = lambda topic, message: self._sent.append((topic.name, _as_message(topic, message)))
         node.enqueue = lambda job: job()
         node.has_listener, node.publish_status = (lambda topic: False), (lambda: None)
         node.calibration, node.state = calibration, NodeState.READY
         node.create_stage(calibration)
         node.on_session(messages.Session(0, "start"))
         return node
+
+
+def _as_message(topic: Topic, message: Any) -> Any:
+    """Return what a topic carries as a message, also where it was sent as bytes."""
+    return deserialize_message(message, message_type(topic)) if isinstance(message, bytes) else message
 
 
 @pytest.fixture

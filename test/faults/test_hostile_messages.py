@@ -5,6 +5,7 @@ A few thousand inputs of each kind in every run; a hundred thousand in those mar
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import zipfile
 import zlib
@@ -22,10 +23,12 @@ from hostile import TEXTS, Dice, corrupted, mutated, with_other_numbers
 from hypothesis import given
 from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
+from rclpy.serialization import deserialize_message, serialize_message
 from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import Image as ImageMessage
 from tiny_bag import CALIBRATION, TYPES, TinyBag
 
-from vli_common import geometry, messages, ply
+from vli_common import cdr, geometry, messages, ply
 from vli_common.calibration import parse_calibration
 from vli_common.errors import CalibrationError, InputError, MessageError, VliError
 from vli_common.messages.limits import LARGEST, LARGEST_VARIANCE
@@ -125,7 +128,10 @@ KINDS = {
     "odometry": Kind(messages.odometry_to_message(pose()), messages.odometry_from_message),
     "pose": Kind(messages.pose_to_message(pose()), messages.pose_from_message),
     "tf": Kind(messages.pose_transforms(pose())[0], messages.transform_from_message),
-    "image_long": Kind(messages.image_to_message(Image(STAMP_NS, np.zeros((8, 8, 3), np.uint8))), messages.image_from_message),
+    "image_long": Kind(
+        deserialize_message(messages.image_to_cdr(Image(STAMP_NS, np.zeros((8, 8, 3), np.uint8))), ImageMessage),
+        messages.image_from_message,
+    ),
     "image_raw": Kind(messages.encoded_to_message(BGR), messages.encoded_from_message),
     "compressed": Kind(
         messages.encoded_to_message(EncodedImage(STAMP_NS, b"\xff\xd8", "jpeg", compressed=True)), messages.encoded_from_message
@@ -166,12 +172,38 @@ def read_hostile(data: bytes) -> None:
     """Read a mutation of some message: it is refused as malformed, or sound."""
     dice = Dice(data)
     kind = KINDS[dice.of(sorted(KINDS))]
+    read_one(kind.read, mutated(kind.good, dice))
+
+
+def read_one(read: Callable[[Any], Any], message: Any) -> None:
     try:
-        value = kind.read(mutated(kind.good, dice))
+        value = read(message)
     except MessageError as error:
         assert_one_line(error)
         return
     assert_sound(value)
+
+
+WIRED = {name: cdr.READERS[kind] for name, kind in (
+    ("imu", cdr.IMU), ("image_long", cdr.IMAGE), ("image_raw", cdr.IMAGE), ("compressed", cdr.COMPRESSED_IMAGE),
+)}  # fmt: skip
+"""Kinds that the nodes read from the bytes of the message."""
+
+
+def read_hostile_bytes(data: bytes) -> None:
+    """Read a mutation of some message, or of its bytes, as they come over the wire in either order: refused, or sound."""
+    dice = Dice(data)
+    name = dice.of(sorted(WIRED))
+    kind, type_name = KINDS[name], type(KINDS[name].good).__name__
+    message = mutated(kind.good, dice) if dice.below(2) else kind.good
+    wire = serialize_message(message)
+    if dice.below(2):
+        name_in_store = f"sensor_msgs/msg/{type_name}"
+        with contextlib.suppress(UnicodeDecodeError):
+            wire = bytes(TYPES.serialize_cdr(TYPES.deserialize_cdr(wire, name_in_store), name_in_store, little_endian=False))
+    if message is kind.good or dice.below(2):
+        wire = corrupted(wire, dice)
+    read_one(lambda item: kind.read(cdr.read(WIRED[name], item)), wire)
 
 
 @inputs(2000)
@@ -188,9 +220,25 @@ def test_a_hundred_thousand_mutated_messages_are_refused_or_sound(data):
     read_hostile(data)
 
 
+@inputs(3000)
+@given(decisions)
+def test_mutated_bytes_of_a_message_are_refused_or_sound(data):
+    read_hostile_bytes(data)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@inputs(100_000)
+@given(decisions)
+def test_a_hundred_thousand_mutated_bytes_of_messages_are_refused_or_sound(data):
+    read_hostile_bytes(data)
+
+
 @pytest.mark.parametrize("name", sorted(KINDS))
 def test_the_good_messages_are_good(name):
     assert_sound(KINDS[name].read(KINDS[name].good))
+    if name in WIRED:
+        assert_sound(KINDS[name].read(cdr.read(WIRED[name], serialize_message(KINDS[name].good))))
 
 
 ARCHIVE = preintegration().measurements.serialize()

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
 import math
 import typing
 from collections.abc import Iterator, Mapping, Sequence
@@ -84,7 +85,7 @@ def section(factory: type[T]) -> T:
 
 def parameters(config_type: type, prefix: str = "") -> Iterator[ParameterSpec]:
     """Yield every parameter of a config dataclass, nested ones with dotted names."""
-    hints = typing.get_type_hints(config_type)
+    hints = _hints(typing.cast(Any, config_type))
     for item in dataclasses.fields(config_type):
         kind = hints[item.name]
         if dataclasses.is_dataclass(kind):
@@ -180,7 +181,7 @@ def _yaml_scalar(value: Any) -> str:
 
 
 def _build(config_type: type[T], flat: Mapping[str, Any], prefix: str) -> T:
-    hints = typing.get_type_hints(config_type)
+    hints = _hints(typing.cast(Any, config_type))
     values: dict[str, Any] = {}
     for item in dataclasses.fields(typing.cast(Any, config_type)):
         kind, name = hints[item.name], prefix + item.name
@@ -189,3 +190,9 @@ def _build(config_type: type[T], flat: Mapping[str, Any], prefix: str) -> T:
         elif name in flat:
             values[item.name] = float(flat[name]) if kind is float else flat[name]
     return config_type(**values)
+
+
+@functools.cache
+def _hints(config_type: type) -> dict[str, Any]:
+    """Return the types of the fields, which are written as text: a node asks for its config several times a second."""
+    return typing.get_type_hints(config_type)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import rclpy
 
-from vli_common.messages import image_to_message, scan_to_message
+from vli_common.messages import image_to_cdr, scan_to_message
 from vli_common.topics import IMAGE_LONG, LASER_POINTS
 from vli_common.types import Image, LaserScan
 from vli_mapping.nodes.mapping_node import MappingNode
@@ -42,7 +42,7 @@ def callback(node: MappingNode, topic: str):
 def test_a_mapper_that_is_eight_seconds_behind_loses_no_colour(node):
     receive = callback(node, IMAGE_LONG.name)
     for stamp_ns in range(BEHIND_S * LONG_HZ):
-        receive(image_to_message(Image(stamp_ns, np.zeros((4, 4, 3), np.uint8))))
+        receive(image_to_cdr(Image(stamp_ns, np.zeros((4, 4, 3), np.uint8))))
     values = dropped(node)
     assert values["waiting.image_long"] == str(BEHIND_S * LONG_HZ)
     assert "dropped.image_long" not in values

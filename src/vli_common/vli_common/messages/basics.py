@@ -12,6 +12,7 @@ from sensor_msgs.msg import CompressedImage
 from sensor_msgs.msg import Image as ImageMessage
 from std_msgs.msg import Header
 
+from vli_common import cdr
 from vli_common.camera import CameraModel
 from vli_common.errors import MessageError
 from vli_common.messages.pointcloud import byte_array
@@ -44,7 +45,7 @@ def to_time(stamp_ns: int) -> Time:
     return Time(sec=seconds, nanosec=nanoseconds)
 
 
-def from_time(stamp: Time) -> int:
+def from_time(stamp: Time | cdr.Stamp) -> int:
     """Return the nanoseconds of a ROS stamp.
 
     Raises:
@@ -60,22 +61,18 @@ def header(stamp_ns: int, frame: str) -> Header:
     return Header(stamp=to_time(stamp_ns), frame_id=frame)
 
 
-def image_to_message(image: Image) -> ImageMessage:
-    """Return ``image_long`` or ``image_short``."""
+def image_to_cdr(image: Image) -> bytes:
+    """Return ``image_long`` or ``image_short`` as it goes over the wire: rclpy would copy the pixels three times on the way."""
     height, width = image.pixels.shape[:2]
     encoding = "bgr8" if image.is_colour else "mono8"
-    return ImageMessage(
-        header=header(image.stamp_ns, CAMERA_FRAME),
-        height=height,
-        width=width,
-        encoding=encoding,
-        step=width * _CHANNELS[encoding],
-        data=byte_array(image.pixels),
-    )
+    stamp = to_time(image.stamp_ns)
+    head = cdr.Header(cdr.Stamp(stamp.sec, stamp.nanosec), CAMERA_FRAME)
+    pixels = np.ascontiguousarray(image.pixels).reshape(-1)
+    return cdr.write_image(cdr.Image(head, height, width, encoding, False, width * _CHANNELS[encoding], pixels.data))
 
 
-def image_from_message(message: ImageMessage, session: int = 0, camera: CameraModel | None = None) -> Image:
-    """Return the image of ``image_long`` or ``image_short``; its pixels are a view of the message's data.
+def image_from_message(message: ImageMessage | cdr.Image, session: int = 0, camera: CameraModel | None = None) -> Image:
+    """Return the image of ``image_long`` or ``image_short``.
 
     Args:
         message: from a topic, not to be trusted.
@@ -93,7 +90,8 @@ def image_from_message(message: ImageMessage, session: int = 0, camera: CameraMo
     if camera is not None and (width, height) != (camera.width, camera.height):
         raise MessageError(f"image is '{width} x {height}', expected {camera.width} x {camera.height} as the calibration says")
     rows = np.frombuffer(message.data, np.uint8).reshape(height, step)[:, : width * channels]
-    pixels = rows.reshape(height, width, channels) if channels > 1 else rows
+    # A copy: kernels are compiled for arrays that can be written and have no gaps, for others it would be done on the spot.
+    pixels = (rows.reshape(height, width, channels) if channels > 1 else rows).copy()
     return Image(from_time(message.header.stamp), pixels, session)
 
 
@@ -106,15 +104,15 @@ def encoded_to_message(image: EncodedImage) -> ImageMessage | CompressedImage:
     return ImageMessage(header=head, height=image.height, width=image.width, encoding=image.encoding, step=image.step, data=data)
 
 
-def encoded_from_message(message: ImageMessage | CompressedImage) -> EncodedImage:
+def encoded_from_message(message: ImageMessage | CompressedImage | cdr.Image | cdr.CompressedImage) -> EncodedImage:
     """Return what the camera sent, in any encoding, undecoded.
 
     Raises:
         MessageError: no data, or sizes that do not fit the data.
     """
     stamp_ns = from_time(message.header.stamp)
-    if isinstance(message, CompressedImage):
-        if not message.data:
+    if isinstance(message, CompressedImage | cdr.CompressedImage):
+        if not len(message.data):
             raise MessageError("compressed image has no data")
         return EncodedImage(stamp_ns, message.data.tobytes(), message.format, compressed=True)
     _check_image_size(message, 1)
@@ -152,7 +150,7 @@ def exposure_from_message(message: DiagnosticArray) -> tuple[int, float | None, 
     return from_time(message.header.stamp), exposure_s, None if laser is None else laser == "on"
 
 
-def _check_image_size(message: ImageMessage, bytes_per_pixel: int) -> None:
+def _check_image_size(message: ImageMessage | cdr.Image, bytes_per_pixel: int) -> None:
     width, height, step, size = message.width, message.height, message.step, len(message.data)
     if width < 1 or height < 1 or step < width * bytes_per_pixel or size != step * height:
         raise MessageError(f"image of '{width}' × '{height}' pixels in rows of '{step}' bytes does not fit its '{size}' bytes")

@@ -18,6 +18,7 @@ import numpy as np
 from geometry_msgs.msg import TwistStamped
 from sensor_msgs.msg import Imu, PointCloud2
 
+from vli_common import cdr
 from vli_common.arrays import FloatArray
 from vli_common.errors import MessageError
 from vli_common.frame_pairing import NoPreintegration
@@ -50,7 +51,8 @@ _PARTS = {
 _COVARIANCES = [name for name in _PARTS if name.startswith("walk") or name.endswith("covariance")]
 _SPAN_TOLERANCE_S = 1e-6
 _NO_DATA = -1.0
-_NUMBER = re.compile(r"-?\d\.\d+e[+-]\d+")
+_NUMBER = re.compile(r"(-?[0-9]\.[0-9]+e[+-][0-9]+)")
+"""One group: splitting leaves the skeleton at the even places, the numbers at the odd ones."""
 
 
 def imu_to_message(sample: ImuSample) -> Imu:
@@ -61,7 +63,7 @@ def imu_to_message(sample: ImuSample) -> Imu:
     return message
 
 
-def imu_from_message(message: Imu) -> ImuSample:
+def imu_from_message(message: Imu | cdr.Imu) -> ImuSample:
     """Return one sample.
 
     Raises:
@@ -155,10 +157,10 @@ def _measurements(data: bytes) -> gtsam.PreintegratedCombinedMeasurements:
 
 def _check_archive(text: str) -> None:
     """Raise where an archive is not of the form, or its numbers are not of the size, that preintegrating leads to."""
-    tokens = text.split()
-    if _skeleton(tokens) != _reference_skeleton():
+    tokens = _NUMBER.split(text)
+    if tokens[::2] != _reference_skeleton():
         raise MessageError("preintegration has an archive of another form (other GTSAM version, or values that are not finite)")
-    numbers = np.array([float(token) for token in tokens if _NUMBER.fullmatch(token)])
+    numbers = np.array([float(token) for token in tokens[1::2]])
     if len(numbers) != sum(_PARTS.values()):
         raise MessageError(f"preintegration has '{len(numbers)}' numbers, expected {sum(_PARTS.values())}: another GTSAM version")
     parts = dict(zip(_PARTS, np.split(numbers, np.cumsum(list(_PARTS.values()))[:-1]), strict=True))
@@ -186,12 +188,8 @@ def _check_covariance(name: str, values: FloatArray) -> None:
         raise MessageError(f"preintegration has a {name} that is not positive definite") from None
 
 
-def _skeleton(tokens: list[str]) -> tuple[str, ...]:
-    return tuple("#" if _NUMBER.fullmatch(token) else token for token in tokens)
-
-
 @functools.lru_cache(maxsize=1)
-def _reference_skeleton() -> tuple[str, ...]:
+def _reference_skeleton() -> list[str]:
     params = gtsam.PreintegrationCombinedParams.MakeSharedU(9.81)
     text: str = gtsam.PreintegratedCombinedMeasurements(params, gtsam.imuBias.ConstantBias()).serialize()
-    return _skeleton(text.split())
+    return _NUMBER.split(text)[::2]

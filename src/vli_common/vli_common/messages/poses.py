@@ -15,7 +15,7 @@ from geometry_msgs.msg import (
 )
 from nav_msgs.msg import Odometry, Path
 
-from vli_common import geometry
+from vli_common import cdr, geometry
 from vli_common.arrays import FloatArray
 from vli_common.errors import MessageError
 from vli_common.messages.basics import from_time, header
@@ -134,7 +134,7 @@ def relocalisation_from_message(message: PoseWithCovarianceStamped, session: int
     return Relocalisation(stamp_ns, T_map_session, float(np.sqrt(variances.max())), session)
 
 
-def from_vector(vector: Vector3) -> FloatArray:
+def from_vector(vector: Vector3 | cdr.Vector) -> FloatArray:
     """Return (3,) of a vector.
 
     Raises:

@@ -79,7 +79,7 @@ class WorkingNode(ManagedNode):
 
         Args:
             topic: of the table.
-            read: message → type; what it refuses is dropped and counted.
+            read: message → type; what it refuses is dropped and counted. It gets what :mod:`vli_common.cdr` reads where that can.
             handle: gets what is of the present session.
             name: to subscribe to in place of the topic's own.
             ends: False for feedback, which does not tell the end of the input.
@@ -90,9 +90,12 @@ class WorkingNode(ManagedNode):
         entry = Input(topic, name or topic.name, ends, required, sheds)
         most = limit or _QUEUE_DEPTHS * topic.depth
 
+        def read_decoded(message: Any) -> T:
+            return read(entry.decoded(message))
+
         def accept(message: Any) -> None:
             entry.count()
-            self._worker.put(topic.name, partial(self._process, entry, read, handle, message, entry.last_s), most)
+            self._worker.put(topic.name, partial(self._process, entry, read_decoded, handle, message, entry.last_s), most)
 
         callback = SPINNER.receiver(accept, lambda: entry.subscription)
         entry.subscribe(self, callback)

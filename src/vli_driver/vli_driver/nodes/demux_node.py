@@ -14,7 +14,7 @@ from vli_common.messages import (
     Session,
     encoded_from_message,
     exposure_from_message,
-    image_to_message,
+    image_to_cdr,
     scan_to_message,
 )
 from vli_common.node import VliNode, run_node
@@ -132,12 +132,12 @@ class DemuxNode(VliNode):
     def _emit(self, frames: list[tuple[Exposure, Image]]) -> None:
         for exposure, image in frames:
             if exposure is Exposure.LONG:
-                self.send(IMAGE_LONG, image_to_message(image))
+                self.send(IMAGE_LONG, image_to_cdr(image))
                 continue
             if self._scanner is not None:
                 self.send(LASER_POINTS, scan_to_message(self._scanner.scan(image)))
             if self.has_listener(IMAGE_SHORT):
-                self.send(IMAGE_SHORT, image_to_message(image))
+                self.send(IMAGE_SHORT, image_to_cdr(image))
 
 
 def _read_exposure(message: Any) -> ExposureNote:
