@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
@@ -18,8 +17,8 @@ from typing import IO
 import yaml
 
 from vli_bringup.graph import NodeDescription
+from vli_bringup.node_starter import NodeServer, Process, ServedProcess, last_line, start_singly
 from vli_common.errors import VliError
-from vli_common.node.main import STOP_WITH_PARENT
 from vli_common.node.transport import remove_dead_segments
 
 MAX_RESTARTS = 3
@@ -28,6 +27,7 @@ _RESTART_PERIOD_S = 60.0
 _FINAL_CODES = (0, 2)
 """Of :func:`vli_common.node.run_node`: told to stop, could not start. It would be the same again."""
 _STOP_S = 5.0
+_WAIT_S = 0.1
 
 
 class GraphError(VliError):
@@ -40,17 +40,23 @@ class _Child:
 
     node: NodeDescription
     arguments: list[str]
-    process: subprocess.Popen[bytes]
+    process: Process
     log: IO[bytes]
     restarts: int = 0
     recent: deque[float] = field(default_factory=lambda: deque(maxlen=MAX_RESTARTS))
+
+    @property
+    def is_started(self) -> bool:
+        """False while the server still loads."""
+        return not isinstance(self.process, ServedProcess) or self.process.started_pid is not None
 
 
 class NodeProcesses:
     """Context manager: all nodes run inside, none is left after.
 
-    A node that crashes is started again by :meth:`check`, three times a minute at most, while the others go on; one that cannot
-    start, or was told to stop, is not.
+    A server loads what they have in common once and forks them, see :mod:`vli_bringup.node_server`. A node that crashes is
+    started again by :meth:`check`, three times a minute at most, while the others go on; one that cannot start, or was told to
+    stop, is not.
 
     Args:
         nodes: see :func:`vli_bringup.graph.describe_graph`.
@@ -62,25 +68,29 @@ class NodeProcesses:
         self._nodes, self._parameter_file = nodes, parameter_file
         self._tell = tell or _write_line
         self._children: dict[str, _Child] = {}
+        self._server: NodeServer | None = None
         self._directory = tempfile.TemporaryDirectory(prefix="vli-graph-")
 
     def __enter__(self) -> NodeProcesses:
-        """Start every node."""
+        """Have every node started: at once, or as soon as the server has loaded them."""
+        self._server = NodeServer([node.module for node in self._nodes])
         for node in self._nodes:
             own = Path(self._directory.name) / f"{node.executable}.yaml"
             own.write_text(yaml.safe_dump({f"/**/{node.executable}": {"ros__parameters": dict(node.parameters)}}))
             files = [argument for path in (self._parameter_file, own) for argument in ("--params-file", str(path))]
-            arguments = [sys.executable, "-m", node.module, "--ros-args", *files]
-            self._children[node.executable] = _Child(node, arguments, *_start(arguments))
+            arguments = ["--ros-args", *files]
+            self._children[node.executable] = _Child(node, arguments, *self._start(node, arguments))
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         """Stop every node: politely, then firmly."""
         for sign in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
-            running = [child.process for child in self._children.values() if child.process.poll() is None]
+            running = [child.process for child in self._children.values() if child.is_started and child.process.poll() is None]
             for process in running:
                 process.send_signal(sign)
             _wait(running, time.monotonic() + _STOP_S)
+        if self._server is not None:
+            self._server.close()
         for child in self._children.values():
             child.log.close()
         remove_dead_segments()
@@ -92,6 +102,7 @@ class NodeProcesses:
         Raises:
             GraphError: a node has ended for good; with its own last line.
         """
+        self._look_after_server()
         for name, child in self._children.items():
             code = child.process.poll()
             if code is None:
@@ -106,7 +117,7 @@ class NodeProcesses:
             child.restarts += 1
             child.log.close()
             remove_dead_segments()
-            child.process, child.log = _start(child.arguments)
+            child.process, child.log = self._start(child.node, child.arguments)
             self._tell(f"{told}; it is started again")
 
     def forgive(self) -> None:
@@ -116,7 +127,9 @@ class NodeProcesses:
 
     @property
     def pids(self) -> dict[str, int]:
-        """Process id of each node."""
+        """Process id of each node; waits until all are started."""
+        while not all(child.is_started for child in self._children.values()):
+            self._look_after_server(_WAIT_S)
         return {name: child.process.pid for name, child in self._children.items()}
 
     @property
@@ -124,19 +137,35 @@ class NodeProcesses:
         """How often each node that crashed was started again."""
         return {name: child.restarts for name, child in self._children.items() if child.restarts}
 
+    def _start(self, node: NodeDescription, arguments: Sequence[str]) -> tuple[Process, IO[bytes]]:
+        """Return a process that runs, or will as soon as it can, and the file that its standard error goes to."""
+        log = tempfile.TemporaryFile()  # noqa: SIM115  It lives as long as the process.
+        if self._server is None:
+            return start_singly(node, arguments, log), log
+        return self._server.start(node, arguments, log), log
 
-def _start(arguments: Sequence[str]) -> tuple[subprocess.Popen[bytes], IO[bytes]]:
-    """Return a running process, and the file that its standard error goes to."""
-    log = tempfile.TemporaryFile()  # noqa: SIM115  It lives as long as the process.
-    environment = {**os.environ, STOP_WITH_PARENT: str(os.getpid())}
-    # A session of its own: Ctrl-C is for the command, which has things to ask of the nodes before it stops them.
-    process = subprocess.Popen(
-        arguments, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=log, env=environment, start_new_session=True
-    )
-    return process, log
+    def _look_after_server(self, timeout_s: float = 0.0) -> None:
+        """Hear the server; start the nodes without it where it could not start any.
+
+        Raises:
+            GraphError: it has ended, and its nodes with it.
+        """
+        if self._server is None:
+            return
+        self._server.listen(timeout_s)
+        if self._server.failure is None:
+            return
+        if any(child.is_started for child in self._children.values()):
+            raise GraphError(f"the process that starts the nodes is gone: {self._server.failure}")
+        self._tell(f"every node is loaded by itself, which takes longer: {self._server.failure}")
+        self._server.close()
+        self._server = None
+        for child in self._children.values():
+            child.log.close()
+            child.process, child.log = self._start(child.node, child.arguments)
 
 
-def _wait(processes: list[subprocess.Popen[bytes]], deadline_s: float) -> None:
+def _wait(processes: list[Process], deadline_s: float) -> None:
     for process in processes:
         try:
             process.wait(max(0.0, deadline_s - time.monotonic()))
@@ -148,13 +177,7 @@ def _cause(name: str, code: int, log: IO[bytes]) -> str:
     """Return why a node ended: its own last line, unless it had no time to say one."""
     if code < 0:
         return f"{name} was ended by {signal.Signals(-code).name}"
-    return _last_line(log) or f"{name} ended with code '{code}' and said nothing"
-
-
-def _last_line(log: IO[bytes]) -> str:
-    log.seek(0)
-    lines = [line for line in log.read().decode(errors="replace").splitlines() if line.strip()]
-    return lines[-1].strip() if lines else ""
+    return last_line(log) or f"{name} ended with code '{code}' and said nothing"
 
 
 def _write_line(text: str) -> None:
