@@ -127,10 +127,10 @@ def test_hostile_messages_end_no_node_and_the_scan_goes_on_once_they_stop(graph:
         before = graph.poses
         for item in BagReader(repository / "bags" / "demo" / "bag", start_s=start_s, duration_s=duration_s):
             if isinstance(item, ImuSample):
-                graph.put(IMU.name, messages.imu_to_message(item), share)
+                graph.put(IMU.name, _as_message(IMU, messages.imu_to_cdr(item)), share)
             else:
                 topic = IMAGE_RAW_COMPRESSED if item.compressed else IMAGE_RAW
-                graph.put(topic.name, messages.encoded_to_message(item), share)
+                graph.put(topic.name, _as_message(topic, messages.encoded_to_cdr(item)), share)
         counts.append(graph.poses - before)
     assert sum(graph.hostile.values()) > 100
     assert set(graph.hostile) >= {IMU.name, IMAGE_RAW_COMPRESSED.name, "image_long", "laser_points", "tracks", "preintegration"}

@@ -25,6 +25,7 @@ from hypothesis import strategies as st
 from mcap.writer import CompressionType, Writer
 from rclpy.serialization import deserialize_message, serialize_message
 from scipy.spatial.transform import Rotation
+from sensor_msgs.msg import CompressedImage, Imu
 from sensor_msgs.msg import Image as ImageMessage
 from tiny_bag import CALIBRATION, TYPES, TinyBag
 
@@ -123,7 +124,9 @@ KINDS = {
     "map": Kind(messages.cloud_to_message(cloud()), messages.cloud_from_message),
     "preintegration": Kind(messages.preintegration_to_message(preintegration()), messages.preintegration_from_message),
     "no preintegration": Kind(messages.no_preintegration_message(STAMP_NS, 3), messages.preintegration_from_message),
-    "imu": Kind(messages.imu_to_message(ImuSample(STAMP_NS, np.ones(3), np.ones(3))), messages.imu_from_message),
+    "imu": Kind(
+        deserialize_message(messages.imu_to_cdr(ImuSample(STAMP_NS, np.ones(3), np.ones(3))), Imu), messages.imu_from_message
+    ),
     "bias": Kind(messages.bias_to_message(ImuBias(STAMP_NS, np.ones(3), np.ones(3))), messages.bias_from_message),
     "odometry": Kind(messages.odometry_to_message(pose()), messages.odometry_from_message),
     "pose": Kind(messages.pose_to_message(pose()), messages.pose_from_message),
@@ -132,9 +135,12 @@ KINDS = {
         deserialize_message(messages.image_to_cdr(Image(STAMP_NS, np.zeros((8, 8, 3), np.uint8))), ImageMessage),
         messages.image_from_message,
     ),
-    "image_raw": Kind(messages.encoded_to_message(BGR), messages.encoded_from_message),
+    "image_raw": Kind(deserialize_message(messages.encoded_to_cdr(BGR), ImageMessage), messages.encoded_from_message),
     "compressed": Kind(
-        messages.encoded_to_message(EncodedImage(STAMP_NS, b"\xff\xd8", "jpeg", compressed=True)), messages.encoded_from_message
+        deserialize_message(
+            messages.encoded_to_cdr(EncodedImage(STAMP_NS, b"\xff\xd8", "jpeg", compressed=True)), CompressedImage
+        ),
+        messages.encoded_from_message,
     ),
     "exposure": Kind(messages.exposure_to_message(BGR), messages.exposure_from_message),
     "session": Kind(messages.session_to_message(messages.Session(3, "why", STAMP_NS)), messages.session_from_message),

@@ -1,4 +1,4 @@
-"""The few messages that come at sensor rate or are large, read from their CDR bytes: out of a bag, or from a topic.
+"""The few messages that come at sensor rate or are large, read from their CDR bytes, out of a bag or from a topic, and written.
 
 The layout is XCDR1 as ROS 2 writes it: a four-byte encapsulation header, then fields aligned to their own size, counted from
 the end of that header. What is read has the fields of the message by the same names, as far as anyone here needs them; only the
@@ -11,6 +11,7 @@ import struct
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
+from vli_common.arrays import FloatArray
 from vli_common.errors import MessageError
 
 IMAGE = "sensor_msgs/msg/Image"
@@ -22,7 +23,11 @@ IMU_DOUBLES = 37
 """Numbers of an Imu message, after its header: orientation, angular rate and acceleration, each with its covariance."""
 GYRO, ACCEL = slice(13, 16), slice(25, 28)
 """Where among them angular rate and acceleration are."""
+NO_DATA = -1.0
+"""As the first number of a covariance: what it is of is not there."""
+_NO_ROTATION, _ORIENTATION_COVARIANCE = 3, 4
 _GYRO_COVARIANCE, _ACCEL_COVARIANCE = slice(16, 25), slice(28, 37)
+_DOUBLES = struct.Struct(f"<{IMU_DOUBLES}d")
 _LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 
 T = TypeVar("T")
@@ -69,7 +74,7 @@ class Image(NamedTuple):
     encoding: str
     is_bigendian: int
     step: int
-    data: memoryview
+    data: memoryview | bytes
 
 
 class CompressedImage(NamedTuple):
@@ -77,7 +82,7 @@ class CompressedImage(NamedTuple):
 
     header: Header
     format: str
-    data: memoryview
+    data: memoryview | bytes
 
 
 class Cursor:
@@ -170,12 +175,35 @@ READERS: dict[str, Callable[[Cursor], Any]] = {IMU: imu, IMAGE: image, COMPRESSE
 """ROS interface name → reader."""
 
 
+def write_imu(header: Header, gyro: FloatArray, accel: FloatArray) -> bytes:
+    """Return the CDR bytes of an Imu message that says of its orientation that there is none.
+
+    Args:
+        header: of the sample.
+        gyro, accel: (3,) rad/s and m/s².
+    """
+    values = [0.0] * IMU_DOUBLES
+    values[_NO_ROTATION], values[_ORIENTATION_COVARIANCE] = 1.0, NO_DATA
+    values[GYRO], values[ACCEL] = gyro.tolist(), accel.tolist()
+    start = _header(header)
+    return b"".join((_LITTLE_ENDIAN, start, bytes(-len(start) % 8), _DOUBLES.pack(*values)))
+
+
 def write_image(message: Image) -> bytes:
     """Return the CDR bytes of an Image message; the pixels are copied once."""
-    start = struct.pack("<iI", *message.header.stamp) + _string(message.header.frame_id)
-    start = _aligned(start) + struct.pack("<II", message.height, message.width) + _string(message.encoding)
+    start = _aligned(_header(message.header)) + struct.pack("<II", message.height, message.width) + _string(message.encoding)
     start = _aligned(start + struct.pack("B", message.is_bigendian)) + struct.pack("<II", message.step, len(message.data))
     return b"".join((_LITTLE_ENDIAN, start, message.data))
+
+
+def write_compressed_image(message: CompressedImage) -> bytes:
+    """Return the CDR bytes of a CompressedImage message."""
+    start = _aligned(_aligned(_header(message.header)) + _string(message.format)) + struct.pack("<I", len(message.data))
+    return b"".join((_LITTLE_ENDIAN, start, message.data))
+
+
+def _header(header: Header) -> bytes:
+    return struct.pack("<iI", *header.stamp) + _string(header.frame_id)
 
 
 def _string(text: str) -> bytes:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from geometry_msgs.msg import Vector3
 from rclpy.serialization import deserialize_message, serialize_message
 from rosbags.typesys import Stores, get_typestore
 from sensor_msgs.msg import CompressedImage, Image, Imu
@@ -74,6 +75,23 @@ def test_an_image_is_written_as_ros_reads_it(frame: str) -> None:
     message = image(frame)
     found = cdr.read(cdr.image, serialize_message(message))
     assert deserialize_message(cdr.write_image(found), Image) == message
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+def test_a_compressed_image_is_written_as_ros_reads_it(frame: str) -> None:
+    message = compressed(frame)
+    found = cdr.read(cdr.compressed_image, serialize_message(message))
+    assert deserialize_message(cdr.write_compressed_image(found), CompressedImage) == message
+
+
+@pytest.mark.parametrize("frame", FRAMES)
+def test_a_sample_is_written_as_ros_reads_it(frame: str) -> None:
+    expected = Imu(header=imu(frame).header)
+    expected.orientation_covariance[0] = -1.0
+    expected.angular_velocity, expected.linear_acceleration = Vector3(x=1.0, y=2.0, z=3.0), Vector3(x=4.0, y=5.0, z=6.0)
+    header = cdr.read(cdr.imu, serialize_message(expected)).header
+    data = cdr.write_imu(header, np.array([1.0, 2.0, 3.0]), np.array([4.0, 5.0, 6.0]))
+    assert deserialize_message(data, Imu) == expected
 
 
 @pytest.mark.parametrize("name", MESSAGES)

@@ -15,7 +15,6 @@ from std_msgs.msg import Header
 from vli_common import cdr
 from vli_common.camera import CameraModel
 from vli_common.errors import MessageError
-from vli_common.messages.pointcloud import byte_array
 from vli_common.status import Health, NodeState, StageStatus
 from vli_common.topics import CAMERA_FRAME
 from vli_common.types import NANOSECONDS, EncodedImage, Image
@@ -61,13 +60,18 @@ def header(stamp_ns: int, frame: str) -> Header:
     return Header(stamp=to_time(stamp_ns), frame_id=frame)
 
 
+def wire_header(stamp_ns: int, frame: str) -> cdr.Header:
+    """Return the same for :mod:`vli_common.cdr`."""
+    stamp = to_time(stamp_ns)
+    return cdr.Header(cdr.Stamp(stamp.sec, stamp.nanosec), frame)
+
+
 def image_to_cdr(image: Image) -> bytes:
     """Return ``image_long`` or ``image_short`` as it goes over the wire: rclpy would copy the pixels three times on the way."""
     height, width = image.pixels.shape[:2]
     encoding = "bgr8" if image.is_colour else "mono8"
-    stamp = to_time(image.stamp_ns)
-    head = cdr.Header(cdr.Stamp(stamp.sec, stamp.nanosec), CAMERA_FRAME)
     pixels = np.ascontiguousarray(image.pixels).reshape(-1)
+    head = wire_header(image.stamp_ns, CAMERA_FRAME)
     return cdr.write_image(cdr.Image(head, height, width, encoding, False, width * _CHANNELS[encoding], pixels.data))
 
 
@@ -95,13 +99,12 @@ def image_from_message(message: ImageMessage | cdr.Image, session: int = 0, came
     return Image(from_time(message.header.stamp), pixels, session)
 
 
-def encoded_to_message(image: EncodedImage) -> ImageMessage | CompressedImage:
-    """Return the message of ``/camera/image_raw`` or ``/camera/image_raw/compressed``."""
-    head = header(image.stamp_ns, CAMERA_FRAME)
-    data = byte_array(np.frombuffer(image.data, np.uint8))
+def encoded_to_cdr(image: EncodedImage) -> bytes:
+    """Return ``/camera/image_raw`` or ``/camera/image_raw/compressed`` as it goes over the wire."""
+    head = wire_header(image.stamp_ns, CAMERA_FRAME)
     if image.compressed:
-        return CompressedImage(header=head, format=image.encoding, data=data)
-    return ImageMessage(header=head, height=image.height, width=image.width, encoding=image.encoding, step=image.step, data=data)
+        return cdr.write_compressed_image(cdr.CompressedImage(head, image.encoding, image.data))
+    return cdr.write_image(cdr.Image(head, image.height, image.width, image.encoding, False, image.step, image.data))
 
 
 def encoded_from_message(message: ImageMessage | CompressedImage | cdr.Image | cdr.CompressedImage) -> EncodedImage:
@@ -114,9 +117,9 @@ def encoded_from_message(message: ImageMessage | CompressedImage | cdr.Image | c
     if isinstance(message, CompressedImage | cdr.CompressedImage):
         if not len(message.data):
             raise MessageError("compressed image has no data")
-        return EncodedImage(stamp_ns, message.data.tobytes(), message.format, compressed=True)
+        return EncodedImage(stamp_ns, bytes(message.data), message.format, compressed=True)
     _check_image_size(message, 1)
-    return EncodedImage(stamp_ns, message.data.tobytes(), message.encoding, message.width, message.height, message.step)
+    return EncodedImage(stamp_ns, bytes(message.data), message.encoding, message.width, message.height, message.step)
 
 
 def exposure_to_message(image: EncodedImage) -> DiagnosticArray:

@@ -22,7 +22,7 @@ from vli_common import cdr
 from vli_common.arrays import FloatArray
 from vli_common.errors import MessageError
 from vli_common.frame_pairing import NoPreintegration
-from vli_common.messages.basics import from_time, header
+from vli_common.messages.basics import from_time, header, wire_header
 from vli_common.messages.limits import LARGEST, checked
 from vli_common.messages.pointcloud import cloud_from_rows, cloud_session, field_count, rows_from_cloud
 from vli_common.messages.poses import from_vector, to_vector
@@ -50,17 +50,13 @@ _PARTS = {
 """Numbers of an archive, in their order: parameters, then what was measured with them."""
 _COVARIANCES = [name for name in _PARTS if name.startswith("walk") or name.endswith("covariance")]
 _SPAN_TOLERANCE_S = 1e-6
-_NO_DATA = -1.0
 _NUMBER = re.compile(r"(-?[0-9]\.[0-9]+e[+-][0-9]+)")
 """One group: splitting leaves the skeleton at the even places, the numbers at the odd ones."""
 
 
-def imu_to_message(sample: ImuSample) -> Imu:
-    """Return ``/imu``; the orientation is marked as absent."""
-    message = Imu(header=header(sample.stamp_ns, IMU_FRAME))
-    message.angular_velocity, message.linear_acceleration = to_vector(sample.gyro), to_vector(sample.accel)
-    message.orientation_covariance[0] = _NO_DATA
-    return message
+def imu_to_cdr(sample: ImuSample) -> bytes:
+    """Return ``/imu`` as it goes over the wire; the orientation is marked as absent."""
+    return cdr.write_imu(wire_header(sample.stamp_ns, IMU_FRAME), sample.gyro, sample.accel)
 
 
 def imu_from_message(message: Imu | cdr.Imu) -> ImuSample:
@@ -69,7 +65,7 @@ def imu_from_message(message: Imu | cdr.Imu) -> ImuSample:
     Raises:
         MessageError: not finite, or marked as holding no angular rate or no acceleration.
     """
-    if message.angular_velocity_covariance[0] == _NO_DATA or message.linear_acceleration_covariance[0] == _NO_DATA:
+    if message.angular_velocity_covariance[0] == cdr.NO_DATA or message.linear_acceleration_covariance[0] == cdr.NO_DATA:
         raise MessageError("IMU message says that it holds no angular rate or no acceleration (covariance '-1')")
     return ImuSample(
         from_time(message.header.stamp), from_vector(message.angular_velocity), from_vector(message.linear_acceleration)

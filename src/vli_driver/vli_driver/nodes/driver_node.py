@@ -10,7 +10,7 @@ from std_msgs.msg import String
 
 from vli_common.calibration import Calibration, to_yaml
 from vli_common.errors import VliError
-from vli_common.messages import encoded_to_message, exposure_to_message, imu_to_message
+from vli_common.messages import encoded_to_cdr, exposure_to_message, imu_to_cdr
 from vli_common.node import VliNode, run_node
 from vli_common.status import Health, NodeState
 from vli_common.topics import CALIBRATION, EXPOSURE, IMAGE_RAW, IMAGE_RAW_COMPRESSED, IMU
@@ -154,11 +154,11 @@ class DriverNode(VliNode):
 
     def _publish_item(self, item: EncodedImage | ImuSample) -> None:
         if isinstance(item, ImuSample):
-            self.send(IMU, imu_to_message(item))
+            self.send(IMU, imu_to_cdr(item))
             return
         if item.laser_on is not None or item.exposure_s is not None:
             self.send(EXPOSURE, exposure_to_message(item))
-        self.send(IMAGE_RAW_COMPRESSED if item.compressed else IMAGE_RAW, encoded_to_message(item))
+        self.send(IMAGE_RAW_COMPRESSED if item.compressed else IMAGE_RAW, encoded_to_cdr(item))
 
 
 def main() -> None:
