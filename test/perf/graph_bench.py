@@ -132,11 +132,14 @@ class Graph:
         return float(status.values.get(name, "0") or 0) if status else 0.0
 
     def is_linked(self, node: str, since_ns: int) -> bool:
-        """Return True where a node that was killed at a wall clock time works again, in one session with the others."""
+        """Return True where a node that was killed at a wall clock time works again, in one session with the others.
+
+        It has played, or handled, data of this session.
+        """
         statuses = [self.listener.statuses.get(name) for name in NODES]
         if self.value(node, "started_ns") <= since_ns or None in statuses:
             return False
-        if node == SCANNER and not self.value(node, "position_ns"):
+        if not self.value(node, "position_ns" if node == SCANNER else "handled"):
             return False
         known = [status for status in statuses if status is not None]
         works = all(status.state in (NodeState.READY, NodeState.FINISHED) and not status.values["unmatched"] for status in known)

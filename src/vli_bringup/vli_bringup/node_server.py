@@ -71,8 +71,9 @@ def load(modules: Iterable[str]) -> None:
 def serve(connection: socket.socket) -> None:
     """Start what is asked for and tell what has ended, until the other end is closed.
 
-    A request is ``{"module": ..., "arguments": [...]}`` with a file descriptor for standard error. The answers: ``{"pid": ...}``
-    for each request, in order, and ``{"pid": ..., "code": ...}`` for each process that has ended, negative for a signal.
+    A request is ``{"module": ..., "arguments": [...], "environment": {...}}`` with a file descriptor for standard error. The
+    answers: ``{"pid": ...}`` for each request, in order, and ``{"pid": ..., "code": ...}`` for each process that has ended,
+    negative for a signal.
     """
     awake, wake = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
     signal.signal(signal.SIGCHLD, lambda *_: None)
@@ -88,9 +89,7 @@ def serve(connection: socket.socket) -> None:
             if not message:
                 return
             request = json.loads(message)
-            _send(
-                connection, {"pid": _fork(request["module"], request["arguments"], files[0], (connection.fileno(), awake, wake))}
-            )
+            _send(connection, {"pid": _fork(request, files[0], (connection.fileno(), awake, wake))})
             os.close(files[0])
 
 
@@ -109,7 +108,7 @@ def _ended() -> list[tuple[int, int]]:
     return found
 
 
-def _fork(module: str, arguments: list[str], log: int, own: Iterable[int]) -> int:
+def _fork(request: dict[str, Any], log: int, own: Iterable[int]) -> int:
     """Start a node that has none of the server's ``own`` file descriptors; return its process id."""
     parent = os.getpid()
     # A signal that comes before the copy has its own handlers waits until it has.
@@ -122,12 +121,13 @@ def _fork(module: str, arguments: list[str], log: int, own: Iterable[int]) -> in
         signal.set_wakeup_fd(-1)
         for descriptor in own:
             os.close(descriptor)
-        _become(module, arguments, log, parent, before)
+        os.environ.update(request["environment"], **{STOP_WITH_PARENT: str(parent)})
+        _become(request["module"], request["arguments"], log, before)
     signal.pthread_sigmask(signal.SIG_SETMASK, before)
     return pid
 
 
-def _become(module: str, arguments: list[str], log: int, parent: int, mask: Iterable[int]) -> NoReturn:
+def _become(module: str, arguments: list[str], log: int, mask: Iterable[int]) -> NoReturn:
     """Be a node, as if started by ``python -m module arguments``."""
     try:
         # A session of its own: Ctrl-C is for the command, which has things to ask of the nodes before it stops them.
@@ -138,7 +138,6 @@ def _become(module: str, arguments: list[str], log: int, parent: int, mask: Iter
             os.dup2(source, target)
         os.close(log)
         os.close(nothing)
-        os.environ[STOP_WITH_PARENT] = str(parent)
         name = module.rpartition(".")[2]
         Path("/proc/self/comm").write_text(name[:_NAME_BYTES])
         sys.argv[:] = [name, *arguments]

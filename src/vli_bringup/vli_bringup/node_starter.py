@@ -11,7 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Protocol
 
@@ -48,9 +48,9 @@ class Process(Protocol):
         """Send a signal; nothing happens where it has ended."""
 
 
-def start_singly(node: NodeDescription, arguments: Sequence[str], log: IO[bytes]) -> Process:
-    """Return a node as a process of its own, standard error to ``log``."""
-    environment = {**os.environ, STOP_WITH_PARENT: str(os.getpid())}
+def start_singly(node: NodeDescription, arguments: Sequence[str], log: IO[bytes], further: Mapping[str, str]) -> Process:
+    """Return a node as a process of its own, standard error to ``log``, with ``further`` variables in its environment."""
+    environment = {**os.environ, **further, STOP_WITH_PARENT: str(os.getpid())}
     command = [sys.executable, "-m", node.module, *arguments]
     # A session of its own: Ctrl-C is for the command, which has things to ask of the nodes before it stops them.
     return subprocess.Popen(
@@ -87,11 +87,11 @@ class NodeServer:
         """Its process id."""
         return self._process.pid
 
-    def start(self, node: NodeDescription, arguments: Sequence[str], log: IO[bytes]) -> ServedProcess:
-        """Ask for a node; it runs as soon as the server has loaded it."""
+    def start(self, node: NodeDescription, arguments: Sequence[str], log: IO[bytes], further: Mapping[str, str]) -> ServedProcess:
+        """Ask for what :func:`start_singly` returns; it runs as soon as the server has loaded it."""
         process = ServedProcess(self)
         self._asked.append(process)
-        request = json.dumps({"module": node.module, "arguments": list(arguments)}).encode()
+        request = json.dumps({"module": node.module, "arguments": list(arguments), "environment": dict(further)}).encode()
         try:
             socket.send_fds(self._connection, [request], [log.fileno()])
         except OSError:

@@ -19,7 +19,7 @@ import yaml
 from vli_bringup.graph import NodeDescription
 from vli_bringup.node_starter import NodeServer, Process, ServedProcess, last_line, start_singly
 from vli_common.errors import VliError
-from vli_common.node.transport import remove_dead_segments
+from vli_common.node.transport import remove_dead_segments, use_fresh_ports
 
 MAX_RESTARTS = 3
 """Of one node within a minute."""
@@ -140,9 +140,11 @@ class NodeProcesses:
     def _start(self, node: NodeDescription, arguments: Sequence[str]) -> tuple[Process, IO[bytes]]:
         """Return a process that runs, or will as soon as it can, and the file that its standard error goes to."""
         log = tempfile.TemporaryFile()  # noqa: SIM115  It lives as long as the process.
+        starts = sum(child.restarts for child in self._children.values())
+        further = use_fresh_ports(Path(self._directory.name), starts) if starts else {}
         if self._server is None:
-            return start_singly(node, arguments, log), log
-        return self._server.start(node, arguments, log), log
+            return start_singly(node, arguments, log, further), log
+        return self._server.start(node, arguments, log, further), log
 
     def _look_after_server(self, timeout_s: float = 0.0) -> None:
         """Hear the server; start the nodes without it where it could not start any.

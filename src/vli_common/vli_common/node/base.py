@@ -28,6 +28,7 @@ T = TypeVar("T")
 
 _STATUS_PERIOD_S = 1.0
 _LOOK_PERIOD_S = 0.1
+_ABOUT_THE_NODE = {topic.name for topic in (STATUS, DIAGNOSTICS, SESSION, CALIBRATION)}
 _WAITING_HINT = "waiting for a calibration: give 'calibration_file' to the driver node or to this one"
 _MOST_OTHERS = 64
 """Nodes that are kept in mind; a name costs a sender nothing."""
@@ -68,7 +69,8 @@ class VliNode(WorkingNode):
         self._backlog = Backlog()
         self.is_behind = False
         """True where the message that is being handled came too long ago, and those before it too: leave out what can be."""
-        self._told_unmatched = ""
+        self._told = ("", False)
+        self._handled = 0
         self._finished_sources: dict[str, dict[str, str]] = {}
         self._started_ns = time.time_ns()
         self.others: dict[str, StageStatus] = {}
@@ -206,12 +208,19 @@ class VliNode(WorkingNode):
         self.serve("resume", self._resume)
 
     def _look_around(self) -> None:
-        """See whether this is the end, and say at once when an input finds its publisher, or loses it: others wait for that."""
+        """See whether this is the end, and say at once what others wait for.
+
+        That an input has found its publisher, or lost it, and that the node has begun to work.
+        """
         self._check_finish()
-        unmatched = self._unmatched()
-        if unmatched != self._told_unmatched:
-            self._told_unmatched = unmatched
+        now = (self._unmatched(), self._is_working())
+        if now != self._told:
+            self._told = now
             self.publish_status()
+
+    def _is_working(self) -> bool:
+        """Return True once data of the session have been handled; of a source, once it has sent some."""
+        return bool(self._handled) if self._inputs else any(name not in _ABOUT_THE_NODE for name in list(self._sent.values))
 
     def _make_ready(self) -> None:
         self.set_state(NodeState.WARMING)
@@ -251,6 +260,7 @@ class VliNode(WorkingNode):
             self.counters.add(f"{entry.topic.name}_of_other_sessions")
             return
         handle(value)
+        self._handled += 1
         self.latency.add(time.monotonic() - arrived_s)
 
     def fail(self, error: Exception) -> None:
@@ -308,7 +318,7 @@ class VliNode(WorkingNode):
             entry.received = 0
 
         def begin() -> None:
-            self.session, self._sent = session.number, Counters()
+            self.session, self._sent, self._handled = session.number, Counters(), 0
             if self.parameters.changed and self.state not in (NodeState.UNCONFIGURED, NodeState.WAITING):
                 self.parameters.changed = False
                 self.create_stage(self.calibration)
@@ -388,7 +398,13 @@ class VliNode(WorkingNode):
             health=health,
             state=self.state,
             hint=self._hint or self._calibration_hint or hint,
-            values={"session": str(self.session), "started_ns": str(self.started_ns), **values, **self._figures()},
+            values={
+                "session": str(self.session),
+                "started_ns": str(self.started_ns),
+                "handled": str(self._handled),
+                **values,
+                **self._figures(),
+            },
         )
 
     def _figures(self) -> dict[str, str]:

@@ -16,6 +16,8 @@ from vli_common.topics import Topic
 _PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 _READER_FACTOR = 8
 _SEGMENT_LOCK = re.compile(r"fastrtps_[0-9a-f]{16}_el")
+_FIRST_PORT, _PORT_STEP, _PORT_STEPS = 11, 32, 7
+"""Offset of the first participant's port for data within the 250 of a domain (RTPS 2.2, 9.6.1.1), and how far others move it."""
 LOCAL_PROFILE = Path(__file__).with_name("fastdds_local.xml")
 NETWORK_PROFILE = Path(__file__).with_name("fastdds_network.xml")
 
@@ -24,6 +26,24 @@ def set_transport_profile(profile: Path = LOCAL_PROFILE) -> None:
     """Let Fast DDS use ``profile`` unless the environment names one already; call before ``rclpy.init``."""
     if not any(os.environ.get(name) for name in _PROFILE_VARIABLES):
         os.environ[_PROFILE_VARIABLES[0]] = str(profile)
+
+
+def use_fresh_ports(directory: Path, number: int) -> dict[str, str]:
+    """Return the environment in which a node that is started again listens where its predecessor did not.
+
+    The others go on writing to the shared memory of a port whose owner was killed, until Fast DDS notices after two seconds. A
+    new owner of the same port has shared memory of its own, and hears nothing until then. Empty where the profile is not ours.
+
+    Args:
+        directory: for the profile.
+        number: of the start; another one each time.
+    """
+    if any(os.environ.get(name, "") not in ("", str(LOCAL_PROFILE)) for name in _PROFILE_VARIABLES):
+        return {}
+    ports = f"<port><offsetd3>{_FIRST_PORT + _PORT_STEP * (number % _PORT_STEPS)}</offsetd3></port>"
+    profile = directory / f"ports{number}.xml"
+    profile.write_text(LOCAL_PROFILE.read_text().replace("</rtps>", f"{ports}</rtps>"))
+    return {_PROFILE_VARIABLES[0]: str(profile)}
 
 
 def remove_dead_segments(directory: Path = Path("/dev/shm")) -> int:
