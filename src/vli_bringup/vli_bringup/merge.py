@@ -7,8 +7,10 @@ import sys
 from pathlib import Path
 
 from vli_common.errors import InputError, OutputError
+from vli_mapping.allocation import Allocate, on_disk
 from vli_mapping.map_file import SUFFIX, load_map, save_map
 from vli_mapping.merging import merge_maps
+from vli_mapping.snapshot import Snapshot
 from vli_mapping.store import check_place
 
 
@@ -33,15 +35,18 @@ def run(args: argparse.Namespace) -> int:
             f"'{args.out}' ends in '{args.out.suffix}', expected '{SUFFIX}'; 'vli export' makes other formats of it"
         )
     check_place(args.out)
-    snapshots = []
-    for path in args.maps:
-        snapshots.append(load_map(path / f"map{SUFFIX}" if path.is_dir() else path))
-        if not len(snapshots[-1]):
-            raise InputError(f"map '{path}' is empty, there is nothing to merge")
-    merged, registrations = merge_maps(snapshots)
+    allocate = on_disk(args.out.absolute().parent)
+    merged, registrations = merge_maps((_load(path, allocate) for path in args.maps), allocate=allocate)
     save_map(args.out, merged)
     for path, found in zip(args.maps[1:], registrations, strict=True):
         shared = f"{100 * found.agreeing:.0f} % of the overlap alike, {1e3 * found.rms_m:.3f} mm RMS point to plane"
         sys.stdout.write(f"'{path}': {shared}\n")
     sys.stdout.write(f"{len(merged)} points in '{args.out}'\n")
     return 0
+
+
+def _load(path: Path, allocate: Allocate) -> Snapshot:
+    snapshot = load_map(path / f"map{SUFFIX}" if path.is_dir() else path, allocate)
+    if not len(snapshot):
+        raise InputError(f"map '{path}' is empty, there is nothing to merge")
+    return snapshot

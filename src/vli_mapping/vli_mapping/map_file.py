@@ -16,12 +16,13 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
 from vli_common.arrays import AnyArray, FloatArray
 from vli_common.errors import InputError
+from vli_mapping.allocation import Allocate, in_memory
 from vli_mapping.keyframe_arrays import NAMES as KEYFRAME_ARRAYS
 from vli_mapping.keyframe_arrays import pack, unpack
 from vli_mapping.light import Light
@@ -38,6 +39,8 @@ _EPOCH = (1980, 1, 1, 0, 0, 0)
 """Of every entry: the same map is the same file."""
 _VIEWS = "views"
 _MAX_HEADER_BYTES = 1 << 16
+_CHUNK_BYTES, _CHUNK_ROWS = 1 << 20, 1 << 18
+"""Read, and looked at, at a time."""
 _REACH_M = 1e4
 """A map is of what the laser has reached; beyond, a place has no cell in the hash that points are found by."""
 _UNIT = 1.0 + 1e-3
@@ -68,15 +71,19 @@ def save_map(path: Path, snapshot: Snapshot) -> None:
         os.fsync(stream.fileno())
 
 
-def load_map(path: Path) -> Snapshot:
+def load_map(path: Path, allocate: Allocate = in_memory) -> Snapshot:
     """Read a map.
+
+    Args:
+        path: of the file.
+        allocate: where its points are kept.
 
     Raises:
         InputError: no such file, no map, of another version, or damaged.
     """
     with _reading(path) as archive:
         header = _read_header(path, archive)
-        columns = {name: _read_array(archive, name) for name in (*_names(), _VIEWS)}
+        columns = {name: _read_array(archive, name, allocate) for name in (*_names(), _VIEWS)}
         has_keyframes = header["version"] != _WITHOUT_KEYFRAMES
         keyframes = unpack({name: _read_array(archive, name) for name in KEYFRAME_ARRAYS}) if has_keyframes else ()
         light = None if header["light"] is None else _light_from_json(header["light"])
@@ -146,19 +153,35 @@ def _read_header(path: Path, archive: zipfile.ZipFile) -> dict[str, Any]:
     return header
 
 
-def _read_array(archive: zipfile.ZipFile, name: str) -> AnyArray:
+def _read_array(archive: zipfile.ZipFile, name: str, allocate: Allocate = in_memory) -> AnyArray:
     """Return a column; what it says of itself is believed only as far as the file has the bytes for it."""
     info = archive.getinfo(f"{name}.npy")
     if info.compress_type != zipfile.ZIP_STORED:
         raise ValueError(f"'{name}' is compressed")
+    if info.file_size > Path(str(archive.filename)).stat().st_size:
+        raise ValueError(f"'{name}' is longer than the file")
     with archive.open(info) as entry:
         if np.lib.format.read_magic(entry) != (1, 0):
             raise ValueError(f"'{name}' is of another version")
         shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(entry)
-        data = entry.read()
-    if dtype.hasobject or is_fortran or math.prod(shape) * dtype.itemsize != len(data):
-        raise ValueError(f"'{name}' is '{dtype}{list(shape)}', which is not what its '{len(data)}' bytes are")
-    return np.frombuffer(bytearray(data), dtype).reshape(shape)
+        size = info.file_size - entry.tell()
+        if dtype.hasobject or is_fortran or math.prod(shape) * dtype.itemsize != size:
+            raise ValueError(f"'{name}' is '{dtype}{list(shape)}', which is not what its '{size}' bytes are")
+        array = allocate(shape, dtype)
+        _fill(entry, array.reshape(-1).view(np.uint8).data)
+    return array
+
+
+def _fill(entry: IO[bytes], target: memoryview) -> None:
+    """Read an entry to its end, where its checksum is compared."""
+    at = 0
+    while chunk := entry.read(_CHUNK_BYTES):
+        if at + len(chunk) > len(target):
+            break
+        target[at : at + len(chunk)] = chunk
+        at += len(chunk)
+    if at != len(target):
+        raise ValueError(f"it has '{at}' bytes where '{len(target)}' should be")
 
 
 def _checked(path: Path, header: dict[str, Any], arrays: dict[str, AnyArray], light: Light | None) -> Snapshot:
@@ -181,7 +204,13 @@ def _checked(path: Path, header: dict[str, Any], arrays: dict[str, AnyArray], li
 
 def _is_sound(columns: Columns, views: FloatArray) -> bool:
     """Return False where a number is none that mapping can have come to."""
-    sized = (np.abs(columns.position) < _REACH_M).all() and (np.abs(views) < _REACH_M).all()
+    starts = range(0, len(columns.weight), _CHUNK_ROWS)
+    pieces = (columns.at(slice(start, start + _CHUNK_ROWS)) for start in starts)
+    return bool((np.abs(views) < _REACH_M).all()) and all(_are_sound(piece) for piece in pieces)
+
+
+def _are_sound(columns: Columns) -> bool:
+    sized = (np.abs(columns.position) < _REACH_M).all()
     shaped = (np.abs(columns.normal) <= _UNIT).all() and not np.isinf(columns.planarity).any()
     # Colours may be NaN: of points that no long image saw.
     coloured = not np.isinf(columns.colour).any()

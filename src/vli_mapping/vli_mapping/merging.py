@@ -1,63 +1,95 @@
-"""Several saved maps as one: each is aligned to what the others make up so far, and its points enter like those of a scan."""
+"""Several saved maps as one: each is aligned to what the others make up so far, and its points enter like those of a scan.
+
+Points stay where they were allocated, on the disk if need be; what is made of them in memory is thinned, or a piece at a time.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
 
-from vli_common.arrays import FloatArray
+from vli_common.arrays import FloatArray, Int32Array, IntArray
 from vli_common.geometry import transform
+from vli_mapping.allocation import Allocate, in_memory
 from vli_mapping.config import MapConfig
 from vli_mapping.light import Light
-from vli_mapping.point_map import PointMap, Stripe
+from vli_mapping.point_map import Columns, PointMap, Stripe
 from vli_mapping.registration import ICP_VOXEL_M, Registration, Surface, register, surface_of
-from vli_mapping.snapshot import Snapshot, restore, take
+from vli_mapping.snapshot import Snapshot, restore, view
+from vli_mapping.thinning import thin_to_voxel
+
+_CHUNK_ROWS = 1 << 17
+"""Points that are brought into another light, or thinned, at a time."""
 
 
-def merge_maps(maps: Sequence[Snapshot], config: MapConfig | None = None) -> tuple[Snapshot, list[Registration]]:
+def merge_maps(
+    maps: Iterable[Snapshot], config: MapConfig | None = None, allocate: Allocate = in_memory
+) -> tuple[Snapshot, list[Registration]]:
     """Return one map in the frame of the first, and how each of the others lay in it.
 
     Args:
-        maps: at least one; each shares a part with those before it.
+        maps: at least one; each shares a part with those before it. They are taken one after another.
         config: of the map that results.
+        allocate: where its points are kept.
 
     Raises:
         InputError: a map shares too little with those before it, or fits in more than one way.
     """
-    whole, light = restore(maps[0], config), maps[0].light
+    rest = iter(maps)
+    first = next(rest)
+    whole, light = restore(first, config, allocate), first.light
+    del first
     registrations = []
-    for snapshot in maps[1:]:
-        found = register(_surface(take(whole, light)), _surface(snapshot))
-        join(whole, relit(snapshot, light), found.T_target_source)
+    for snapshot in rest:
+        found = register(_surface(view(whole, light)), _surface(snapshot))
+        join(whole, snapshot, found.T_target_source, light)
         registrations.append(found)
-    return take(whole, light), registrations
+    return view(whole, light), registrations
 
 
-def join(whole: PointMap, snapshot: Snapshot, T_whole_snapshot: FloatArray) -> None:
-    """Enter the points of a map into another, scan by scan as they were seen, with their weights."""
-    c, first = snapshot.columns, len(whole.views)
-    order = np.argsort(c.seen_by, kind="stable")
-    starts = np.flatnonzero(np.diff(c.seen_by[order], prepend=-1))
-    for rows in np.split(order, starts[1:]) if len(order) else []:
-        number = int(c.seen_by[rows[0]])
-        T_snapshot_camera = np.concatenate([snapshot.views[number], [[0.0, 0.0, 0.0, 1.0]]])
-        target = whole.insert(
-            Stripe(
-                stamp_ns=int(c.entered_ns[rows].min()),
-                number=first + number,
-                T_map_camera=T_whole_snapshot @ T_snapshot_camera,
-                points=transform(T_whole_snapshot, c.position[rows]),
-                normals=(c.normal[rows] @ T_whole_snapshot[:3, :3].T).astype(np.float32),
-                planarity=c.planarity[rows],
-                colours=c.colour[rows],
-                sigma=c.sigma[rows].astype(np.float64),
-                solid=c.solid[rows],
-            )
-        )
-        whole.add_weight(target, c.weight[rows] - 1)
+def join(whole: PointMap, snapshot: Snapshot, T_whole_snapshot: FloatArray, light: Light | None) -> None:
+    """Enter the points of a map into another of some ``light``, scan by scan as they were seen, with their weights."""
+    first = len(whole.views)
+    for rows in _whole_scans(snapshot.columns.seen_by):
+        part = relit(replace(snapshot, columns=snapshot.columns.at(rows), keyframes=()), light)
+        starts = np.flatnonzero(np.diff(part.columns.seen_by, prepend=-1))
+        for scan in np.split(np.arange(len(rows)), starts[1:]):
+            _enter(whole, part.columns.at(scan), part.views, T_whole_snapshot, first)
     whole.keyframes.extend(item.moved(T_whole_snapshot) for item in snapshot.keyframes)
+
+
+def _whole_scans(seen_by: Int32Array) -> Iterator[IntArray]:
+    """Yield the rows (N,) sorted by scan, in pieces that no scan is cut by."""
+    order = np.argsort(seen_by, kind="stable")
+    starts = np.flatnonzero(np.diff(seen_by[order], prepend=-1))
+    ends = np.append(starts[1:], len(order))
+    begin = 0
+    for end in ends.tolist():
+        if end - begin >= _CHUNK_ROWS or begin < end == len(order):
+            yield order[begin:end]
+            begin = end
+
+
+def _enter(whole: PointMap, scan: Columns, views: FloatArray, T_whole_snapshot: FloatArray, first: int) -> None:
+    """Enter the points that one scan saw; scans are numbered from ``first`` on."""
+    number = int(scan.seen_by[0])
+    T_snapshot_camera = np.concatenate([views[number], [[0.0, 0.0, 0.0, 1.0]]])
+    target = whole.insert(
+        Stripe(
+            stamp_ns=int(scan.entered_ns.min()),
+            number=first + number,
+            T_map_camera=T_whole_snapshot @ T_snapshot_camera,
+            points=transform(T_whole_snapshot, scan.position),
+            normals=(scan.normal @ T_whole_snapshot[:3, :3].T).astype(np.float32),
+            planarity=scan.planarity,
+            colours=scan.colour,
+            sigma=scan.sigma.astype(np.float64),
+            solid=scan.solid,
+        )
+    )
+    whole.add_weight(target, scan.weight - 1)
 
 
 def relit(snapshot: Snapshot, light: Light | None) -> Snapshot:
@@ -75,7 +107,13 @@ def relit(snapshot: Snapshot, light: Light | None) -> Snapshot:
 
 
 def _surface(snapshot: Snapshot) -> Surface:
-    c = snapshot.columns
-    own = restore(snapshot)
+    """Return the surface of a map, thinned piece by piece before anything is made of it."""
+    columns, kept = snapshot.columns, [np.empty(0, np.int64)]
+    for start in range(0, len(snapshot), _CHUNK_ROWS):
+        piece = columns.at(slice(start, start + _CHUNK_ROWS))
+        flat = np.flatnonzero(piece.normal.any(axis=1))
+        kept.append(start + flat[thin_to_voxel(piece.position[flat], piece.weight[flat], ICP_VOXEL_M)])
+    c = columns.at(np.concatenate(kept))
+    own = restore(replace(snapshot, columns=c, keyframes=()))
     colours = own.shown_colours(own.alive(), snapshot.light, as_seen=False)
     return surface_of(c.position, c.normal, colours, c.weight, ICP_VOXEL_M)

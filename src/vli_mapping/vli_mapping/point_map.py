@@ -8,6 +8,7 @@ import numpy as np
 
 from vli_common.arrays import AnyArray, BoolArray, ByteArray, Float32Array, FloatArray, Int32Array, IntArray
 from vli_common.types import PointCloud
+from vli_mapping.allocation import Allocate, in_memory
 from vli_mapping.config import MapConfig
 from vli_mapping.insertion import FREE, ROWS, insert_stripe, remove
 from vli_mapping.keyframe import MapKeyframe
@@ -51,29 +52,33 @@ class Columns:
     solid: BoolArray
 
     @staticmethod
-    def empty(capacity: int) -> Columns:
+    def empty(capacity: int, allocate: Allocate = in_memory) -> Columns:
         """Return columns of undefined content."""
         narrow = np.float32
         return Columns(
-            np.empty((capacity, 3)),
-            np.empty((capacity, 3), narrow),
-            np.empty((capacity, 3), narrow),
-            np.empty(capacity, narrow),
-            np.empty(capacity, narrow),
-            np.empty(capacity, narrow),
-            np.empty(capacity, np.int32),
-            np.empty(capacity, np.int32),
-            np.empty(capacity, np.int64),
-            np.empty(capacity, np.bool_),
+            allocate((capacity, 3), np.float64),
+            allocate((capacity, 3), narrow),
+            allocate((capacity, 3), narrow),
+            allocate((capacity,), narrow),
+            allocate((capacity,), narrow),
+            allocate((capacity,), narrow),
+            allocate((capacity,), np.int32),
+            allocate((capacity,), np.int32),
+            allocate((capacity,), np.int64),
+            allocate((capacity,), np.bool_),
         )
 
-    def grow(self, capacity: int, count: int) -> None:
+    def grow(self, capacity: int, count: int, allocate: Allocate = in_memory) -> None:
         """Make room for ``capacity`` rows, keeping the first ``count``."""
         for item in fields(self):
             old: AnyArray = getattr(self, item.name)
-            new = np.empty((capacity, *old.shape[1:]), old.dtype)
+            new = allocate((capacity, *old.shape[1:]), old.dtype)
             new[:count] = old[:count]
             setattr(self, item.name, new)
+
+    def at(self, rows: IntArray | slice) -> Columns:
+        """Return some of the rows; of a slice no copy is made."""
+        return Columns(*(getattr(self, item.name)[rows] for item in fields(self)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,11 +127,12 @@ class PointMap:
     Args:
         config: see :class:`MapConfig`.
         capacity: points to make room for at the start; it grows.
+        allocate: where the columns are kept.
     """
 
-    def __init__(self, config: MapConfig | None = None, capacity: int = 1 << 16) -> None:
+    def __init__(self, config: MapConfig | None = None, capacity: int = 1 << 16, allocate: Allocate = in_memory) -> None:
         self.config = config or MapConfig()
-        self.columns = Columns.empty(capacity)
+        self.columns, self._allocate = Columns.empty(capacity, allocate), allocate
         self.grid = SpatialHash(CELL_M, capacity)
         self.views: FloatArray = np.zeros((0, 3, 4))
         """(S, 3, 4), pose of the camera in map by the number of the scan."""
@@ -227,7 +233,7 @@ class PointMap:
         return self.cloud(which, stamp_ns, session, light, as_seen)
 
     def shown_colours(self, which: IntArray, light: Light | None, as_seen: bool) -> Float32Array:
-        """Return the colours (K, 3) of rows ``which``, NaN = unknown.
+        """Return the colours (K, 3) of rows ``which``, each by itself; NaN = unknown. For a finished map see ``albedo``.
 
         Args:
             which: rows.
@@ -268,7 +274,7 @@ class PointMap:
         if needed <= len(self.columns.weight):
             return
         capacity = max(needed, int(_GROWTH * len(self.columns.weight)))
-        self.columns.grow(capacity, self.rows)
+        self.columns.grow(capacity, self.rows, self._allocate)
         self.grid.reserve(capacity, self.columns.position, self.columns.weight[: self.rows] > 0)
 
 

@@ -25,6 +25,8 @@ ICP_VOXEL_M = 5e-4
 """Of the surfaces that are compared: a point each, so that dense parts do not outweigh the rest."""
 _KEYPOINT_M, _SHAPE_M = 1.5e-3, 5e-3
 _BINS = 11
+_PAIRS = 1 << 18
+"""Of points whose angles are found at a time."""
 _COLOUR_WEIGHT = 1.0
 """Of a colour's distance, full scale, against that of the histograms."""
 _TRIES = 4000
@@ -222,26 +224,27 @@ def _matches(a: FloatArray, b: FloatArray) -> tuple[IntArray, IntArray]:
 
 def describe(surface: Surface) -> FloatArray:
     """Return (N, 39): the FPFH of the points within 5 mm around each (33), their mean colour (3) and its spread (3)."""
+    from scipy.sparse import csr_array
     from scipy.spatial import KDTree
 
     count = len(surface.points)
     pairs = KDTree(surface.points).query_pairs(_SHAPE_M, output_type="ndarray")
+    # In pieces: of a large part the pairs are many times its points.
+    simple = np.zeros(3 * _BINS * count)
+    for piece in np.array_split(pairs, len(pairs) // _PAIRS + 1):
+        i, j = np.concatenate([piece, piece[:, ::-1]]).T
+        for feature, value in enumerate(_angles(surface, i, j)):
+            column = np.clip((value * _BINS).astype(np.int64), 0, _BINS - 1) + feature * _BINS
+            simple += np.bincount(i * 3 * _BINS + column, minlength=len(simple))
     i, j = np.concatenate([pairs, pairs[:, ::-1]]).T
-    simple = np.zeros((count, 3 * _BINS))
-    for feature, value in enumerate(_angles(surface, i, j)):
-        column = np.clip((value * _BINS).astype(np.int64), 0, _BINS - 1) + feature * _BINS
-        np.add.at(simple, (i, column), 1.0)
-    neighbours = np.maximum(np.bincount(i, minlength=count), 1)[:, None]
-    simple /= neighbours
+    share = 1.0 / np.maximum(np.bincount(i, minlength=count), 1)
+    histograms = simple.reshape(count, -1) * share[:, None]
     near = 1.0 / (1.0 + np.linalg.norm(surface.points[i] - surface.points[j], axis=1) / _KEYPOINT_M)
-    full = simple.copy()
-    np.add.at(full, i, simple[j] * near[:, None] / neighbours[i])
+    full = histograms + csr_array((near * share[i], (i, j)), shape=(count, count)) @ histograms
     full /= np.maximum(np.linalg.norm(full, axis=1, keepdims=True), 1e-9)
-    mean, square = np.zeros((count, 3)), np.zeros((count, 3))
-    np.add.at(mean, i, surface.colours[j] / 255)
-    np.add.at(square, i, (surface.colours[j] / 255) ** 2)
-    mean /= neighbours
-    spread = np.sqrt(np.maximum(square / neighbours - mean**2, 0.0))
+    average, colours = csr_array((share[i], (i, j)), shape=(count, count)), surface.colours.astype(np.float64) / 255
+    mean = average @ colours
+    spread = np.sqrt(np.maximum(average @ colours**2 - mean**2, 0.0))
     return np.concatenate([full, _COLOUR_WEIGHT * mean, _COLOUR_WEIGHT * spread], axis=1)
 
 

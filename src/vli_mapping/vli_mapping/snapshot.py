@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from vli_common.arrays import AnyArray, FloatArray
+from vli_mapping.allocation import Allocate, in_memory
 from vli_mapping.config import MapConfig
 from vli_mapping.keyframe import MapKeyframe
 from vli_mapping.light import Light
@@ -61,9 +62,16 @@ def take(point_map: PointMap, light: Light | None, exclusively: Exclusively = la
     return Snapshot(_joined(chunks), views, light, keyframes=keyframes)
 
 
-def restore(snapshot: Snapshot, config: MapConfig | None = None) -> PointMap:
-    """Return a map of its own memory that holds what a snapshot does."""
-    result = PointMap(config, capacity=max(len(snapshot), 1 << 16))
+def view(point_map: PointMap, light: Light | None) -> Snapshot:
+    """Return a map as it is, without a copy of its points where none has left; for who owns it alone and changes it no more."""
+    if len(point_map) < point_map.rows:
+        return take(point_map, light)
+    return Snapshot(point_map.columns.at(slice(point_map.rows)), point_map.views, light, keyframes=tuple(point_map.keyframes))
+
+
+def restore(snapshot: Snapshot, config: MapConfig | None = None, allocate: Allocate = in_memory) -> PointMap:
+    """Return a map that holds what a snapshot does, in arrays of its own from ``allocate``."""
+    result = PointMap(config, max(len(snapshot), 1 << 16), allocate)
     result.fill(snapshot.columns, snapshot.views)
     result.keyframes.extend(snapshot.keyframes)
     return result

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ import pytest
 from vli_common.arrays import FloatArray
 from vli_common.errors import InputError
 from vli_common.geometry import pose, so3_exp, transform
+from vli_mapping import merging
+from vli_mapping.allocation import on_disk
 from vli_mapping.light import Light
 from vli_mapping.merging import merge_maps, relit
 from vli_mapping.point_map import PointMap, Stripe
@@ -55,6 +58,22 @@ def scan(x0: float, x1: float, T_map_world: FloatArray = HERE, surface=relief, s
         point_map.insert(stripe)
     point_map.refine_normals(point_map.alive(), transform(T_map_world, np.array([[x0, 0.0, 0.05]]))[0])
     return take(point_map, None)
+
+
+def test_a_merge_on_the_disk_is_that_in_memory(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(merging, "_CHUNK_ROWS", 1000)
+    maps = [scan(-0.01, 0.015), scan(0.0, 0.03, MOVED, seed=1)]
+    (here, _), (there, _) = merge_maps(maps), merge_maps(iter(maps), allocate=on_disk(tmp_path))
+    for item in fields(here.columns):
+        np.testing.assert_array_equal(getattr(here.columns, item.name), getattr(there.columns, item.name))
+
+
+def test_pieces_of_a_map_cut_no_scan(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(merging, "_CHUNK_ROWS", 5)
+    seen_by = np.array([3, 0, 0, 7, 3, 0, 7, 7, 7, 9], np.int32)
+    pieces = [seen_by[rows].tolist() for rows in merging._whole_scans(seen_by)]
+    assert pieces == [[0, 0, 0, 3, 3], [7, 7, 7, 7, 9]]
+    assert list(merging._whole_scans(seen_by[:0])) == []
 
 
 def test_two_maps_that_overlap_become_one_in_the_frame_of_the_first() -> None:
