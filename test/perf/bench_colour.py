@@ -116,13 +116,16 @@ def print_line(name: str, passes: tuple[Pass, Pass], pairs: tuple[IntArray, IntA
 
 def report(data: Path) -> None:
     """Print the lines of one recording."""
+    spans = read_passes(data / "passes.json")[:2].tolist()
+    if len(spans) < 2:
+        raise SystemExit(f"'{data}' has '{len(spans)}' pass, two are needed; 'vli simulate … --preset short' makes two")
     calibration = load_calibration(data / "calibration.yaml")
     frames: list[Image | LaserScan] = list(read_frames(data, calibration))
     light = time_with_truth(data, calibration, ERROR_M, frames=frames).mapper.light()
     if light is None:
         raise SystemExit(f"'{data}' tells too little of the light")
     maps = []
-    for start, end in read_passes(data / "passes.json")[:2].tolist():
+    for start, end in spans:
         timed = time_with_truth(data, calibration, ERROR_M, frames=[item for item in frames if start <= item.stamp_ns <= end])
         timed.mapper.settle()
         maps.append(timed.mapper.map)

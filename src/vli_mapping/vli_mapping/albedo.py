@@ -53,10 +53,9 @@ def finished_cloud(point_map: PointMap, light: Light | None, as_seen: bool, stam
         as_seen: see :meth:`PointMap.shown_colours`; such colours are those of single points.
         stamp_ns, session: of the cloud.
     """
-    cloud = point_map.cloud(None, stamp_ns, session, light, as_seen)
-    if light is None or as_seen or not len(cloud):
-        return cloud
-    return replace(cloud, colours=to_bytes(albedo(point_map, light)))
+    if light is None or as_seen or not len(point_map):
+        return point_map.cloud(None, stamp_ns, session, light, as_seen)
+    return replace(point_map.cloud(None, stamp_ns, session), colours=to_bytes(albedo(point_map, light)))
 
 
 def albedo(point_map: PointMap, light: Light) -> Float32Array:
