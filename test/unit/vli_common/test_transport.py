@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import fcntl
+import re
 from pathlib import Path
 
-from vli_common.node.transport import remove_dead_segments
+import pytest
+
+from vli_common.node.transport import LOCAL_PROFILE, remove_dead_segments, use_fresh_ports
 
 
 def test_shared_memory_of_the_dead_is_removed_and_that_of_the_living_is_not(tmp_path: Path) -> None:
@@ -18,3 +21,22 @@ def test_shared_memory_of_the_dead_is_removed_and_that_of_the_living_is_not(tmp_
         assert remove_dead_segments(tmp_path) == 1
     assert {path.name for path in tmp_path.iterdir()} == {living, f"{living}_el", port, f"{port}_el"}
     assert remove_dead_segments(tmp_path / "none") == 0
+
+
+def test_a_node_started_again_has_ports_of_its_own_unless_the_profile_is_foreign(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("FASTDDS_DEFAULT_PROFILES_FILE", raising=False)
+    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", str(LOCAL_PROFILE))
+    offsets = []
+    for number in range(1, 6):
+        ((variable, profile),) = use_fresh_ports(tmp_path, number).items()
+        assert variable == "FASTRTPS_DEFAULT_PROFILES_FILE"
+        text = Path(profile).read_text()
+        offsets += map(int, re.findall("<offsetd3>([0-9]+)</offsetd3>", text))
+        assert re.sub("<port>.*</port>", "", text) == LOCAL_PROFILE.read_text()
+    assert len(set(offsets)) == 5
+    # Odd, since even ones are for discovery, and none is the first's.
+    assert all(offset % 2 and 11 < offset < 250 for offset in offsets)
+    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", "/my/own.xml")
+    assert use_fresh_ports(tmp_path, 1) == {}
