@@ -28,7 +28,7 @@ def test_a_node_started_again_has_ports_of_its_own_unless_the_profile_is_foreign
 ) -> None:
     monkeypatch.delenv("FASTDDS_DEFAULT_PROFILES_FILE", raising=False)
     monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", str(LOCAL_PROFILE))
-    offsets = []
+    offsets: list[int] = []
     for number in range(1, 6):
         ((variable, profile),) = use_fresh_ports(tmp_path, number).items()
         assert variable == "FASTRTPS_DEFAULT_PROFILES_FILE"
