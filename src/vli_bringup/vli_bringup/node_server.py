@@ -1,8 +1,8 @@
 """A process that has loaded all nodes and starts them as copies of itself.
 
-``python -m vli_bringup.node_server SOCKET MODULE ...``. To import the libraries of a node takes 0.5 to 0.7 s of a processor and
-to load its kernels 0.3 to 0.5 s, twice that where the graph plays meanwhile. Here both are done once for all nodes, and a node
-that is started, or started again, is a fork away.
+``python -m vli_bringup.node_server SOCKET``; the first message names the modules. To import the libraries of a node takes 0.5 to
+0.7 s of a processor and to load its kernels 0.3 to 0.5 s, twice that where the graph plays meanwhile. Here both are done once for
+all nodes, and a node that is started, or started again, is a fork away.
 
 What is forked must not have threads, and must not have spoken ROS. So the kernels run in one thread, and the middleware is loaded
 but not initialised. The two threads that LTTng brings with rclpy sleep until somebody traces; a node that was forked has none.
@@ -156,7 +156,7 @@ def main() -> int:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     connection = socket.socket(fileno=int(sys.argv[1]))
     try:
-        load(sys.argv[2:])
+        load(json.loads(connection.recv(MESSAGE_BYTES) or "[]"))
     except VliError as error:
         sys.stderr.write(f"{error}\n")
         return 2

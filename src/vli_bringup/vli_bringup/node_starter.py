@@ -70,13 +70,15 @@ class NodeServer:
         self._log = tempfile.TemporaryFile()  # noqa: SIM115  It lives as long as the server.
         with other:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", _SERVER, str(other.fileno()), *modules],
+                [sys.executable, "-m", _SERVER, str(other.fileno())],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=self._log,
                 pass_fds=[other.fileno()],
                 start_new_session=True,
             )
+        # Not as arguments: who kills the processes that name a node there would kill all of them.
+        self._connection.send(json.dumps(list(modules)).encode())
         self._asked: list[ServedProcess] = []
         self._started: dict[int, ServedProcess] = {}
         self.failure: str | None = None
