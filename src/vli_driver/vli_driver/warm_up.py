@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 
 from vli_common.calibration import Calibration, LaserCalibration
@@ -14,8 +16,12 @@ from vli_driver.scanner import StripeScanner
 _SIZE = (96, 128)
 
 
+@cache
 def warm_up() -> None:
-    """Scan a synthetic stripe along either axis, in colour and grey; fast where the compiled code is in numba's cache."""
+    """Scan a synthetic stripe along either axis, in colour and grey; fast where the compiled code is in numba's cache.
+
+    Once in a process, and in what was forked from it.
+    """
     camera = make_camera("none", (100.0, 100.0, 64.0, 48.0), (), _SIZE[::-1])
     for axis, normal in ((0, (0.0, 0.8, -0.6)), (1, (0.8, 0.0, -0.6))):
         laser = LaserCalibration(np.array(normal), 0.02, (0.02, 0.15))
