@@ -186,7 +186,7 @@ def bounded_stop(process: subprocess.Popen[bytes], sign: int) -> tuple[int, str]
 
 
 def command(node: NodeDescription) -> list[str]:
-    parameters = [item for name, value in node.parameters.items() for item in ("-p", f"{name}:={value}")]
+    parameters = [item for name, value in node.parameters.items() for item in ("-p", f"{name}:={value!r}")]
     return [sys.executable, "-m", node.module, "--ros-args", *parameters]
 
 
