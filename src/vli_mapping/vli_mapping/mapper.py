@@ -19,6 +19,7 @@ from vli_mapping.map_file import load_map
 from vli_mapping.map_keyframes import KeyframeIntake
 from vli_mapping.point_map import PointMap, Stripe, to_bytes
 from vli_mapping.scan_window import PosedScan, ScanWindow
+from vli_mapping.scene_change import SceneChange
 from vli_mapping.snapshot import Snapshot, restore
 from vli_mapping.whereabouts import Whereabouts
 
@@ -46,6 +47,7 @@ class Mapper:
         self._uses_laser = mode.uses_laser
         self._window = ScanWindow(calibration.camera, self.config, self.counters)
         self._unrefined: list[tuple[IntArray, FloatArray]] = []
+        self._change = SceneChange()
         self._light = LightEstimator()
         self._entering: deque[PosedScan] = deque()
         self._touched: list[IntArray] = []
@@ -112,6 +114,11 @@ class Mapper:
         """False while the window's place in the map is not known: after a loss, or in the map of an earlier session."""
         return self._whereabouts.is_known or not len(self.map)
 
+    @property
+    def hint(self) -> str:
+        """What to do, in words; empty where nothing is wrong."""
+        return self._change.hint if self.is_located else "the place in the map is not known yet: go over a part that is mapped"
+
     def cloud(self, max_points: int | None = None, stamp_ns: int = 0, session: int = 0) -> PointCloud:
         """Return the map, colours as the config asks for; thinned to ``max_points`` where given, each colour then by itself."""
         self.settle()
@@ -162,6 +169,7 @@ class Mapper:
         if len(self.map):
             self.map = PointMap(self.config.map)
         self._unrefined.clear()
+        self._change.clear()
         self._intake.clear()
         self._light = LightEstimator()
         self._window = self._window.successor(session)
@@ -180,6 +188,7 @@ class Mapper:
         self.map = restore(snapshot, self.config.map)
         self._light = LightEstimator(snapshot.light)
         self._unrefined.clear()
+        self._change.clear()
         self._intake.clear()
         self._window.count_from(len(snapshot.views))
 
@@ -211,7 +220,9 @@ class Mapper:
 
     def _enter(self, item: PosedScan) -> IntArray:
         """Merge one scan into the map; return the map points (K,) it touched."""
-        stripe, left = contradict(self.map, _stripe(item))
+        seen = _stripe(item)
+        stripe, left = contradict(self.map, seen)
+        self._change.add(int(seen.solid.sum()), int((seen.solid & ~stripe.solid).sum()))
         target = self.map.insert(stripe)
         touched = np.unique(target[target >= 0])
         self._entered_ns = item.scan.stamp_ns

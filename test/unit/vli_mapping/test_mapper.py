@@ -131,6 +131,39 @@ def test_a_ghost_of_one_scan_does_not_stay_where_the_surface_is_seen() -> None:
     assert doubtful[high].all()
 
 
+def again(mapper: Mapper, later: int, depth: float) -> None:
+    """Go over the scene, ``later`` frames after the first time, with a third of the stripe at so many times its depth."""
+    stamps, kinds, poses = [], [], []
+    for index in range(0, 81):
+        stamp, T = (index + later) * FRAME_NS, pose_at(index)
+        if index % 2:
+            scan = scan_of(stamp, T, T[1, 3])
+            scan.points[100:200] *= depth
+            mapper.add_scan(scan)
+        else:
+            mapper.add_image(long_image(stamp))
+        stamps.append(stamp)
+        kinds.append(FrameKind.SHORT if index % 2 else FrameKind.LONG)
+        poses.append(T)
+    mapper.add_window(window(stamps, kinds, poses))
+    mapper.settle()
+
+
+def test_a_surface_that_is_no_longer_there_is_told_and_one_that_is_still_there_is_not() -> None:
+    mapper = Mapper(calibration())
+    for later in (0, 1000, 2000):
+        again(mapper, later, 1.0)
+    assert mapper.hint == ""
+    again(mapper, 3000, 1.1)
+    assert mapper.hint.startswith("the scene has changed: ")
+    for later in (4000, 5000):
+        again(mapper, later, 1.0)
+    assert mapper.hint == ""
+    again(mapper, 6000, 1.1)
+    mapper.reset(1)
+    assert mapper.hint == ""
+
+
 def perturbed(first: int, last: int, height: float) -> WindowPoses:
     poses = [looking_down(0.0, i * SPEED / 2, 0.03 + height) for i in range(first, last)]
     kinds = [FrameKind.LONG if i % 2 == 0 else FrameKind.SHORT for i in range(first, last)]

@@ -110,11 +110,11 @@ class MappingNode(VliNode):
         return self._mapper.counters if self._mapper else Counters()
 
     def stage_status(self) -> tuple[Health, str, dict[str, str]]:
-        """Return the size of the map, and whether the scanner knows its place in it."""
-        values = {"points": str(len(self._mapper.map) if self._mapper else 0)}
-        if self._mapper is None or self._mapper.is_located:
-            return Health.OK, "", values
-        return Health.WARN, "the place in the map is not known yet: go over a part that is mapped", values
+        """Return the size of the map, whether the scanner knows its place in it, and whether the scene is still as mapped."""
+        if self._mapper is None:
+            return Health.OK, "", {"points": "0"}
+        hint = self._mapper.hint
+        return Health.WARN if hint else Health.OK, hint, {"points": str(len(self._mapper.map))}
 
     @property
     def mapper(self) -> Mapper:
