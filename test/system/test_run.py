@@ -87,7 +87,7 @@ def test_the_final_trajectory_has_the_frames_of_the_live_one_nearby(results):
 
 
 def test_timing_has_a_row_a_long_frame_and_makes_up_the_summary(results, summary):
-    """Camera and map have threads of their own: a frame takes no less than the main thread's stages, and less than all of them."""
+    """Camera and map have their own threads: a frame takes no less than the main thread's stages, and less than all of them."""
     rows = list(csv.DictReader((results / "timing.csv").open()))
     assert len(rows) == summary["frames_long"]
     totals = [float(row["total_ms"]) for row in rows]
