@@ -28,7 +28,7 @@ _SPARSE = 3
 """One in so many points is a neighbour: those along a stripe say the same."""
 _SAME_FACE = float(np.cos(np.radians(40.0)))
 """Cosine between normals of one face: nearer than the flank of a key is to its top."""
-_TILTED, _CURVED = 0.25, 4.0
+_TILTED, _CURVED = 0.05, 1.0
 """Doubt per unit of tan² of an incidence, and of the tan² that the scatter of the normals around comes to."""
 _ROUGH, _SHADOWED = 4.0, 10.0
 """Doubt of a point that has no normal of its own or may fly, and of one that the light does not reach."""

@@ -87,14 +87,15 @@ def test_normals_that_scatter_do_not_speckle_a_flank() -> None:
     point_map = mapped(points, shaken(normals, 0.08), seen(points, normals, np.ones(len(points))))
     every = np.arange(len(points))
     assert spread(point_map.shown_colours(every, LIGHT, as_seen=False)) > 0.1
-    assert spread(albedo(point_map, LIGHT)) < 0.03
+    assert spread(albedo(point_map, LIGHT)) < 0.045
 
 
-def test_on_what_faces_the_light_print_stays_as_sharp_as_it_is() -> None:
-    points, normals = floor()
-    rho = np.where(np.abs(points[:, 0]) < 5e-4, 0.2, 1.0)
+@pytest.mark.parametrize("degrees", [0.0, 40.0])
+def test_on_what_faces_the_light_somehow_print_keeps_its_contrast(degrees: float) -> None:
+    points, normals = flank(degrees)
+    rho = np.where(np.abs(points[:, 1]) < 5e-4, 0.2, 1.0)
     found = albedo(mapped(points, shaken(normals, 0.05), seen(points, normals, rho)), LIGHT)[:, 0]
-    assert found[rho == 0.2].mean() < 0.27 * found[rho == 1.0].mean()
+    assert found[rho == 0.2].mean() < 0.3 * found[rho == 1.0].mean()
 
 
 @pytest.mark.parametrize("spoilt", ["normal", "solid"])
