@@ -31,8 +31,8 @@ from vli_driver.scanner import StripeScanner
 from vli_frontend.frontend import FrontEnd
 from vli_mapping.mapper import Mapper
 
-_AHEAD = 4
-"""Images that the camera's thread may be ahead: a keyframe takes as long as it takes for two long frames and their short ones."""
+_AHEAD = 2
+"""Images that the camera's thread may be ahead. Farther ahead than this, it takes the processor from a keyframe."""
 
 Event = BackEndOutput | WindowPoses | MappingOutput
 """What a push may bring: pose, then window; what the map makes of a window comes before the pose of the next keyframe."""
@@ -66,8 +66,8 @@ class Pipeline:
     The two loops are those of the graph: constraints found with the window of one keyframe enter the solve of the next, eq. (4),
     and the bias of one keyframe enters the preintegration after it.
 
-    An image is worked on when the four after it have come, so that the camera's thread can decode and triangulate ahead while a
-    keyframe is solved; the mapping's has the time from one keyframe to the next. Order and results are those of one thread.
+    An image is worked on when the two after it have come, so that the camera's thread has the time between for decoding and
+    triangulation; the mapping's has the time from one keyframe to the next. Order and results are those of one thread.
 
     Args:
         stages: see :meth:`Stages.create`.
