@@ -1,4 +1,4 @@
-"""Faults F22, F23, F27 and F30: nodes that die, come late, are too slow, or are told to stop. All through real processes."""
+"""Faults F22, F23, F27, F30: nodes that die, hang, come late, are too slow, or are told to stop. All with real processes."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from vli_bringup.listener import LISTENER, GraphListener
 from vli_bringup.processes import NodeProcesses
 from vli_bringup.recorder import Recorder
 from vli_bringup.settings import Settings, to_yaml
+from vli_bringup.watch import GraphWatch
 from vli_common.calibration import load_calibration
 from vli_common.messages import cloud_from_message
 from vli_common.node.transport import message_type, quality
@@ -88,6 +89,25 @@ def test_any_node_killed_and_started_again_is_linked_again_while_the_others_go_o
         assert len(told) == len(NODES)
         wait(listener, lambda: text(listener, _BACK_END, "tracking") == "TRACKING", processes=processes)
         wait(listener, lambda: listener.value(_MAPPING, "points") > 0, processes=processes)
+
+
+@pytest.mark.slow
+def test_a_node_that_hangs_is_ended_and_started_again(demo: Path, parameter_file: Path, listener: GraphListener) -> None:
+    told: list[str] = []
+    with NodeProcesses(demo_graph(demo, _LOOP), parameter_file, told.append) as processes:
+        watch = GraphWatch(processes)
+        wait(listener, lambda: listener.value("driver_node", "position_ns") > 0, processes=processes)
+        os.kill(processes.pids["demux_node"], signal.SIGSTOP)
+        stopped_ns = time.time_ns()
+
+        def healed() -> bool:
+            watch.look(listener.statuses, listener.heard_s)
+            return is_back(listener, "demux_node", stopped_ns)
+
+        wait(listener, healed, 90.0, processes)
+        assert processes.restarts == {"demux_node": 1}
+        assert re.fullmatch(r"demux_node (has said nothing for \d+ s|is cut off: .*)", told[0])
+        assert told[1:] == ["demux_node was ended by SIGKILL; it is started again"]
 
 
 @pytest.mark.slow

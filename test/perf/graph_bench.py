@@ -22,6 +22,7 @@ from vli_bringup.settings import Settings, to_yaml
 from vli_bringup.trajectory_metrics import associate, rms, trajectory_errors
 from vli_bringup.tum import Trajectory
 from vli_bringup.warm_up import warm_up
+from vli_bringup.watch import GraphWatch
 from vli_common.arrays import FloatArray
 from vli_common.calibration import Calibration, load_calibration
 from vli_common.node.transport import message_type, quality
@@ -98,6 +99,7 @@ class Graph:
     processes: NodeProcesses
     listener: GraphListener
     recorder: Recorder
+    watch: GraphWatch
 
     def wait(self, condition: Callable[[], bool], timeout_s: float = _START_S) -> float:
         """Spin until a condition holds; return the seconds that took.
@@ -115,6 +117,7 @@ class Graph:
                 )
                 raise GraphError(f"waited for {timeout_s:g} s in vain: {', '.join(said)}")
             self.listener.spin()
+            self.watch.look(self.listener.statuses, self.listener.heard_s)
         return time.monotonic() - begin_s
 
     def wait_for_frames(self) -> None:
@@ -172,7 +175,7 @@ def graph(
         NodeProcesses([_own(node, own or {}) for node in nodes], parameter_file) as processes,
         GraphListener(recorder) as listener,
     ):
-        yield Graph(processes, listener, recorder)
+        yield Graph(processes, listener, recorder, GraphWatch(processes))
 
 
 def _own(node: NodeDescription, driver: Mapping[str, Any]) -> NodeDescription:

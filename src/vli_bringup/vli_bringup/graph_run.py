@@ -20,6 +20,7 @@ from vli_bringup.processes import GraphError, NodeProcesses
 from vli_bringup.recorder import Recorder
 from vli_bringup.settings import Settings, to_yaml
 from vli_bringup.stopping import stop_on_signals
+from vli_bringup.watch import GraphWatch
 from vli_common.calibration import Calibration
 from vli_common.status import NodeState
 from vli_common.types import Mode
@@ -67,7 +68,7 @@ class RunningGraph:
 
     def __init__(self, processes: NodeProcesses, listener: GraphListener, stop: threading.Event) -> None:
         self.listener, self.stop = listener, stop
-        self._processes = processes
+        self._processes, self._watch = processes, GraphWatch(processes)
 
     def spin(self) -> None:
         """Handle what comes within a tenth of a second, and look after the nodes.
@@ -77,6 +78,7 @@ class RunningGraph:
         """
         self._processes.check()
         self.listener.spin()
+        self._watch.look(self.listener.statuses, self.listener.heard_s)
 
     def wait_until(self, is_ready: Callable[[], bool], blamed: str) -> None:
         """Return when ``is_ready`` says so.

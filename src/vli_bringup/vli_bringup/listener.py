@@ -55,6 +55,8 @@ class GraphListener:
     def __init__(self, recorder: Recorder, latencies: FrameLatencies | None = None) -> None:
         self.statuses: dict[str, StageStatus] = {}
         """The newest status of each node."""
+        self.heard_s: dict[str, float] = {}
+        """When that came, monotonic seconds."""
         self._recorder = recorder
         self._latencies = latencies or FrameLatencies()
         self._poses: dict[int, FloatArray] = {}
@@ -99,7 +101,7 @@ class GraphListener:
     def value(self, node: str, name: str) -> int:
         """Return a number out of the newest status of a node, zero where it has none of this name."""
         status = self.statuses.get(node)
-        return _count(status.values.get(name, "0")) if status else 0
+        return count_of(status.values.get(name, "0")) if status else 0
 
     def losses(self) -> dict[str, int]:
         """Return ``node.topic`` → messages that never reached their stage.
@@ -108,14 +110,14 @@ class GraphListener:
         session, or too early; feedback (``bias``), of which only the newest matters, does not count.
         """
         values = [item for status in self.statuses.values() for item in status.values.items()]
-        sent = {key[5:]: _count(value) for key, value in values if key[:5] == "sent."}
+        sent = {key[5:]: count_of(value) for key, value in values if key[:5] == "sent."}
         lost: dict[str, int] = {}
         for node, status in sorted(self.statuses.items()):
             for key, value in status.values.items():
                 kind, _, name = key.partition(".")
                 if name == BIAS.name or kind not in ("received", "dropped", "node"):
                     continue
-                count = sent.get(name, 0) - _count(value) if kind == "received" else _count(value)
+                count = sent.get(name, 0) - count_of(value) if kind == "received" else count_of(value)
                 if count > 0:
                     lost[f"{node}.{name}"] = lost.get(f"{node}.{name}", 0) + count
         missed = {f"{LISTENER}.{topic.name}": sent.get(topic.name, 0) - self._received[topic.name] for topic in _RECORDED}
@@ -199,7 +201,7 @@ class GraphListener:
         status = status_from_message(message)
         if status.node not in _NODES:
             return
-        self.statuses[status.node] = status
+        self.statuses[status.node], self.heard_s[status.node] = status, time.monotonic()
         if "due_stamp_ns" in status.values:
             self._latencies.add_due(int(status.values["due_stamp_ns"]), int(status.values["due_wall_ns"]))
         if status.node == _BACK_END and "tracking" in status.values:
@@ -207,7 +209,7 @@ class GraphListener:
             self._recorder.add_state(int(values["stamp_ns"]), TrackingState(values["tracking"]), values["reason"])
 
 
-def _count(text: str) -> int:
+def count_of(text: str) -> int:
     """Return a whole number out of a status, zero where there is none."""
     try:
         return int(float(text))

@@ -120,6 +120,13 @@ class NodeProcesses:
             child.process, child.log = self._start(child.node, child.arguments)
             self._tell(f"{told}; it is started again")
 
+    def end(self, node: str, reason: str) -> None:
+        """End a node that is not as it should be; :meth:`check` starts it again."""
+        child = self._children[node]
+        if child.is_started and child.process.poll() is None:
+            self._tell(f"{node} {reason}")
+            child.process.send_signal(signal.SIGKILL)
+
     def forgive(self) -> None:
         """Count the crashes that end the graph anew, for who kills nodes on purpose."""
         for child in self._children.values():

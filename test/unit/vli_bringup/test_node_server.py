@@ -153,3 +153,18 @@ def test_the_end_of_the_server_is_told(package: Path, sleeper: NodeDescription) 
         with pytest.raises(GraphError, match="the process that starts the nodes is gone: ended with code '-9'"):  # noqa: PT012
             while True:
                 processes.check()
+
+
+def test_a_node_that_is_not_as_it_should_be_is_ended_and_started_again(package: Path, sleeper: NodeDescription) -> None:
+    (package / "vli.yaml").write_text("{}")
+    told: list[str] = []
+    with NodeProcesses([sleeper], package / "vli.yaml", told.append) as processes:
+        (before,) = processes.pids.values()
+        processes.end(sleeper.executable, "is cut off")
+        while not processes.restarts:
+            processes.check()
+            time.sleep(0.02)
+        (after,) = processes.pids.values()
+        assert after != before
+    name = sleeper.executable
+    assert told == [f"{name} is cut off", f"{name} was ended by SIGKILL; it is started again"]
