@@ -165,9 +165,8 @@ class Bench:
                 memory.append((now_s - begin_s, {name: resident_mb(pid) for name, pid in pids.items()}))
                 run.wait(lambda until_s=now_s + 2.0: time.monotonic() > until_s)  # type: ignore[misc]
             half_s = begin_s + 30.0 * minutes
-            whole, second = meter.latencies_ms(), meter.latencies_ms(half_s)
+            first, second = meter.latencies_ms(until_s=half_s), meter.latencies_ms(half_s)
             losses, restarts = run.listener.losses(), run.processes.restarts
-        first = whole[: len(whole) - len(second)]
         for name in NODES:
             self._growth(name, memory, lambda sample, name=name: sample[name])
         self._growth("all nodes", memory, lambda sample: sum(sample.values()))

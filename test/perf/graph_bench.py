@@ -70,24 +70,29 @@ class Meter:
     """
 
     def __init__(self, listener: GraphListener) -> None:
-        self.published_s: dict[int, float] = {}
-        self.posed_s: dict[int, float] = {}
+        self._published_s: dict[int, float] = {}
+        self._latencies: list[tuple[float, float]] = []
         for topic in (IMAGE_RAW, IMAGE_RAW_COMPRESSED):
-            self._subscribe(listener, topic, self.published_s)
-        self._subscribe(listener, POSE, self.posed_s)
+            self._subscribe(listener, topic, self._publish)
+        self._subscribe(listener, POSE, self._pose)
 
-    def latencies_ms(self, since_s: float = 0.0) -> FloatArray:
-        """Return the time (N,) from image to pose of every frame posed since, in order."""
-        both = [
-            (self.published_s[stamp], at) for stamp, at in self.posed_s.items() if stamp in self.published_s and at >= since_s
-        ]
-        return 1e3 * np.array([posed - published for published, posed in both])
+    def latencies_ms(self, since_s: float = 0.0, until_s: float = np.inf) -> FloatArray:
+        """Return the time (N,) from image to pose of every frame posed in [since, until) monotonic seconds, in order."""
+        return 1e3 * np.array([latency_s for at_s, latency_s in self._latencies if since_s <= at_s < until_s])
+
+    def _publish(self, stamp_ns: int, now_s: float) -> None:
+        self._published_s[stamp_ns] = now_s
+
+    def _pose(self, stamp_ns: int, now_s: float) -> None:
+        # A bag that is played again has the same stamps again.
+        if (published_s := self._published_s.pop(stamp_ns, None)) is not None:
+            self._latencies.append((now_s, now_s - published_s))
 
     @staticmethod
-    def _subscribe(listener: GraphListener, topic: Topic, times: dict[int, float]) -> None:
+    def _subscribe(listener: GraphListener, topic: Topic, take: Callable[[int, float], None]) -> None:
         def note(serialised: bytes) -> None:
             seconds, nanoseconds = _STAMP.unpack_from(serialised, _CDR_HEADER)
-            times[seconds * NANOSECONDS + nanoseconds] = time.monotonic()
+            take(seconds * NANOSECONDS + nanoseconds, time.monotonic())
 
         listener.node.create_subscription(message_type(topic), topic.name, note, quality(topic, reading=True), raw=True)
 
