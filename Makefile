@@ -10,8 +10,6 @@ INSTALL := -m pip install --quiet --disable-pip-version-check
 BIN := $(VENV)/bin
 # Where the tests, too, look for it by default.
 RECORDING := ../shared/data/keyboard_short
-REDUCE := import sys, cv2; whole = cv2.imread(sys.argv[1]); \
-	cv2.imwrite(sys.argv[2], cv2.resize(whole, (1600, 1000), interpolation=cv2.INTER_AREA), [cv2.IMWRITE_PNG_COMPRESSION, 9])
 # Tests start ROS graphs of their own: they must not meet those of others on the network.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 
@@ -61,13 +59,9 @@ bench: venv
 		$(BIN)/python $$script || failed=1; \
 	done; exit $${failed:-0}
 
-# The picture of the README: cloud.png, smaller, so that the page loads at once.
+# The pictures of the README: cloud and mesh of the scan in bags/.
 pictures: venv
-	scan=$$(mktemp -d) && \
-	$(BIN)/vli run bags/demo/bag --calib bags/demo/calibration.yaml --out $$scan/out && \
-	mkdir -p docs/images && \
-	$(BIN)/python -c '$(REDUCE)' $$scan/out/cloud.png docs/images/demo.png && \
-	rm -r $$scan
+	$(BIN)/python docs/pictures.py docs/images
 
 # Which stage limits: each gets the truth in turn.
 bench-estimator: venv

@@ -61,8 +61,14 @@ def write_views(path: Path, cloud: PointCloud) -> None:
         raise OutputError(f"'{path}' cannot be written: {error.strerror}") from error
 
 
-def draw_views(cloud: PointCloud, size: tuple[int, int] = SHEET) -> ByteArray:
-    """Return the sheet (H, W, 3) BGR of a cloud; a cloud without points gives a sheet that says so."""
+def draw_views(cloud: PointCloud, size: tuple[int, int] = SHEET, caption: str = "") -> ByteArray:
+    """Return the sheet (H, W, 3) BGR of a cloud; a cloud without points gives a sheet that says so.
+
+    Args:
+        cloud: points, with or without normals.
+        size: width and height, pixels.
+        caption: in the corner; the number of points where it is empty.
+    """
     width, height = size
     sheet = _background(width, height)
     if len(cloud) == 0:
@@ -77,7 +83,7 @@ def draw_views(cloud: PointCloud, size: tuple[int, int] = SHEET) -> ByteArray:
         panel = sheet[y : y + h, x : x + w]
         panel[:] = draw(points, colours, normals, view, spacing, panel)
         _label(sheet[y - _TITLE : y, x : x + w], view)
-    _text(sheet, f"{len(cloud):,} points".replace(",", " "), (_MARGIN, height - 14), 0.5, _FAINT)
+    _text(sheet, caption or f"{len(cloud):,} points".replace(",", " "), (_MARGIN, height - 14), 0.5, _FAINT)
     return sheet
 
 
