@@ -11,7 +11,7 @@ standard deviation, with Cauchy weights.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numba
 import numpy as np
@@ -69,11 +69,17 @@ def _relative_poses(rotations, translations):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(cache=True, nogil=True)
+def _whitened(matrix, x, y):  # type: ignore[no-untyped-def]
+    """Return matrix (2, 2) times (x, y)."""
+    return matrix[0, 0] * x + matrix[0, 1] * y, matrix[1, 0] * x + matrix[1, 1] * y
+
+
+@numba.njit(cache=True, nogil=True)
 def _refine(  # type: ignore[no-untyped-def]
-    relative_r, relative_t, use, anchor, anchor_ray, rho, prior, rays, sigma, depth, depth_sigma, cauchy, limits, iterations
+    relative_r, relative_t, use, anchor, anchor_ray, rho, prior, rays, seen, white, depth, depth_sigma, cauchy, limits, iterations
 ):
     """Minimise the cost of every landmark over its own ρ, poses fixed; writes ``rho`` and returns its information (L,)."""
-    count, slots = len(sigma), len(relative_r)
+    count, slots = len(seen), len(relative_r)
     information = np.zeros(count)
     for i in range(count):
         if not use[i]:
@@ -84,8 +90,8 @@ def _refine(  # type: ignore[no-untyped-def]
             g = (rho[i] - prior[i, 0]) * h
             z_a = 1.0 / rho[i]
             for j in range(slots):
-                seen, measured = j != a and sigma[i, j] > 0, depth_sigma[i, j] > 0
-                if not (seen or measured):
+                followed, measured = j != a and seen[i, j], depth_sigma[i, j] > 0
+                if not (followed or measured):
                     continue
                 r, t = relative_r[j, a], relative_t[j, a]
                 d0 = (r[0, 0] * anchor_ray[i, 0] + r[0, 1] * anchor_ray[i, 1] + r[0, 2]) * z_a
@@ -95,12 +101,12 @@ def _refine(  # type: ignore[no-untyped-def]
                 if depth_j <= 1e-6:
                     continue
                 z = 1.0 / depth_j
-                if seen:
-                    s = 1.0 / sigma[i, j]
+                if followed:
+                    m = white[i, j]
                     u, v = (d0 + t[0]) * z, (d1 + t[1]) * z
-                    e0, e1 = (u - rays[i, j, 0]) * s, (v - rays[i, j, 1]) * s
+                    e0, e1 = _whitened(m, u - rays[i, j, 0], v - rays[i, j, 1])
                     # d(d)/dρ = −d / ρ
-                    j0, j1 = -(d0 - u * d2) * z * z_a * s, -(d1 - v * d2) * z * z_a * s
+                    j0, j1 = _whitened(m, -(d0 - u * d2) * z * z_a, -(d1 - v * d2) * z * z_a)
                     w = 1.0 / (1.0 + (e0 * e0 + e1 * e1) / (cauchy * cauchy))
                     h += w * (j0 * j0 + j1 * j1)
                     g += w * (j0 * e0 + j1 * e1)
@@ -140,9 +146,9 @@ def _add_row(hessian, gradient, coupling, row, e, w, jr, a, j):  # type: ignore[
 
 @numba.njit(cache=True, nogil=True)
 def _condense(  # type: ignore[no-untyped-def]
-    relative_r, relative_t, use, anchor, anchor_ray, rho, prior, rays, sigma, depth, depth_sigma, cauchy, hessian, gradient
+    relative_r, relative_t, use, anchor, anchor_ray, rho, prior, rays, seen, white, depth, depth_sigma, cauchy, hessian, gradient
 ):
-    count, slots = len(sigma), len(relative_r)
+    count, slots = len(seen), len(relative_r)
     row, coupling = np.zeros(12), np.empty(6 * slots)
     cost = 0.0
     for i in range(count):
@@ -157,8 +163,8 @@ def _condense(  # type: ignore[no-untyped-def]
         z_a = 1.0 / rho[i]
         p0, p1, p2 = anchor_ray[i, 0] * z_a, anchor_ray[i, 1] * z_a, z_a
         for j in range(slots):
-            seen, measured = j != a and sigma[i, j] > 0, depth_sigma[i, j] > 0
-            if not (seen or measured):
+            followed, measured = j != a and seen[i, j], depth_sigma[i, j] > 0
+            if not (followed or measured):
                 continue
             first, last = min(first, j), max(last, j)
             r, t = relative_r[j, a], relative_t[j, a]
@@ -170,13 +176,13 @@ def _condense(  # type: ignore[no-untyped-def]
             z = 1.0 / x2
             u, v = x0 * z, x1 * z
             for k in range(3):
-                if (k < 2 and not seen) or (k == 2 and not measured):
+                if (k < 2 and not followed) or (k == 2 and not measured):
                     continue
                 if k < 2:
-                    s = 1.0 / sigma[i, j]
-                    e0, e1 = (u - rays[i, j, 0]) * s, (v - rays[i, j, 1]) * s
+                    e0, e1 = _whitened(white[i, j], u - rays[i, j, 0], v - rays[i, j, 1])
                     squared, e = e0 * e0 + e1 * e1, e0 if k == 0 else e1
-                    c0, c1, c2 = (z * s, 0.0, -u * z * s) if k == 0 else (0.0, z * s, -v * z * s)
+                    m0, m1 = white[i, j, k, 0], white[i, j, k, 1]
+                    c0, c1, c2 = m0 * z, m1 * z, -(m0 * u + m1 * v) * z
                 else:
                     s = 1.0 / depth_sigma[i, j]
                     e = (z - depth[i, j]) * s
@@ -217,8 +223,8 @@ class LandmarkArrays:
     """Views on the landmark table that the kernels read; L landmarks, K window slots.
 
     ``anchor`` (L,) int64; ``anchor_ray`` (L, 2); ``rho`` (L,) 1/m, written by :func:`refine`; ``prior`` (L, 2) mean and sigma of
-    ρ; ``rays`` (L, K, 2); ``sigma`` (L, K) of the rays, 0 where not observed; ``depth`` (L, K) measured 1/z in 1/m;
-    ``depth_sigma`` (L, K), 0 where not measured.
+    ρ; ``rays`` (L, K, 2); ``seen`` (L, K) where there is one; ``whitening`` (L, K, 2, 2) that turns an error of a ray into sigmas
+    (:mod:`vli_backend.track_noise`); ``depth`` (L, K) measured 1/z in 1/m; ``depth_sigma`` (L, K), 0 where not measured.
     """
 
     anchor: AnyArray
@@ -226,13 +232,14 @@ class LandmarkArrays:
     rho: FloatArray
     prior: FloatArray
     rays: FloatArray
-    sigma: FloatArray
+    seen: BoolArray
+    whitening: FloatArray
     depth: FloatArray
     depth_sigma: FloatArray
 
     def columns(self) -> tuple[AnyArray, ...]:
         """Return the arrays in the order in which the kernels take them."""
-        return (self.anchor, self.anchor_ray, self.rho, self.prior, self.rays, self.sigma, self.depth, self.depth_sigma)
+        return tuple(getattr(self, field.name) for field in fields(self))
 
 
 def refine(

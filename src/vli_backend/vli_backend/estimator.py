@@ -19,10 +19,11 @@ from vli_backend.plane_residuals import PlaneResiduals, plane_residuals
 from vli_backend.pose_covariance import PoseCovariance
 from vli_backend.prediction import Prediction, Predictor
 from vli_backend.smoother import Condenser, GtsamSmoother, KeyframeState, Smoother, SmootherError, StatePrior
+from vli_backend.track_noise import whitening
 from vli_backend.window import FrameRecord, Window, close_interval
 from vli_common.arrays import BoolArray, FloatArray
 from vli_common.calibration import Calibration
-from vli_common.geometry import inverse, transform
+from vli_common.geometry import inverse
 from vli_common.types import (
     FrontEndOutput,
     ImuBias,
@@ -34,9 +35,6 @@ from vli_common.types import (
     Tracks,
     WindowPoses,
 )
-
-_ADOPTED_SIGMA = 0.005
-"""Least relative sigma of a depth that comes from the window before."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +71,7 @@ class WindowEstimator:
         depths: DepthPrior,
     ) -> None:
         self._config = config
-        self._focal_px = calibration.camera.focal_px
+        self._camera = calibration.camera
         self._T_cam_imu = calibration.T_cam_imu if calibration.T_cam_imu is not None else np.eye(4)
         self._T_imu_cam = inverse(self._T_cam_imu)
         self._depths = depths
@@ -128,19 +126,8 @@ class WindowEstimator:
         return self._points
 
     def adopt(self, landmarks: LandmarkPoints) -> None:
-        """Take what a window that has just ended knew of the depths; only while this one has a single keyframe.
-
-        The prior on each depth is as wide as the old window left it, not narrower than its poses are known.
-        """
-        rows = self._landmarks.rows_of(landmarks.ids)
-        points = transform(inverse(self._records[0].T_map_camera), landmarks.positions)
-        usable = (rows >= 0) & (points[:, 2] > self._depths.near)
-        rows, depth = rows[usable], points[usable, 2]
-        relative = np.linalg.norm(landmarks.spread[usable], axis=1) / np.linalg.norm(points[usable], axis=1)
-        arrays = self._landmarks.arrays
-        arrays.rho[rows] = 1.0 / depth
-        arrays.prior[rows, 0], arrays.prior[rows, 1] = 1.0 / depth, np.maximum(relative, _ADOPTED_SIGMA) / depth
-        self._landmarks.information[rows] = 0.0
+        """Take what a window that has just ended knew of the depths; only while this one has a single keyframe."""
+        self._landmarks.adopt(landmarks, self._records[0].T_map_camera, self._depths.near)
         self._points = self._landmarks.points(self._keyframe_poses())
 
     def recent_keyframes(self, count: int) -> list[int]:
@@ -236,7 +223,7 @@ class WindowEstimator:
             self._points.positions[rows],
             self._points.spread[rows],
             tracks.rays[columns],
-            self._ray_sigma(tracks)[columns],
+            whitening(self._camera, tracks, self._config.pixel_sigma)[columns],
             self._config.cauchy,
         )
         if self._jump(predicted.T_map_camera, found.T_map_camera) < self._largest_jump:
@@ -249,10 +236,6 @@ class WindowEstimator:
         """Return the distance between two poses, metres; infinite where one is not finite."""
         distance = float(np.linalg.norm(after[:3, 3] - before[:3, 3]))
         return distance if np.isfinite(distance) else np.inf
-
-    def _ray_sigma(self, tracks: Tracks) -> FloatArray:
-        result: FloatArray = np.hypot(tracks.sigma_px, self._config.pixel_sigma) / self._focal_px
-        return result
 
     # -- one keyframe ------------------------------------------------------------------------------------------------------
 
@@ -301,7 +284,8 @@ class WindowEstimator:
     def _add_observations(self, tracks: Tracks) -> None:
         self._landmarks.forget_lost(tracks.ids)
         restarted = np.isin(tracks.ids, np.fromiter(self._restarted, np.int64, len(self._restarted)))
-        self._landmarks.add_keyframe(tracks.ids, tracks.rays, self._ray_sigma(tracks), restarted, self._depth_guess())
+        white = whitening(self._camera, tracks, self._config.pixel_sigma)
+        self._landmarks.add_keyframe(tracks.ids, tracks.rays, white, restarted, self._depth_guess())
         self._restarted.clear()
 
     def _depth_guess(self) -> float:
@@ -381,7 +365,7 @@ class WindowEstimator:
             if slot == len(self._window) - 1 and not stripes and self._scans:
                 stripes = [(poses[slot], self._scans[-1])] if len(self._window) == 1 else []
             if stripes:
-                measure_slot(self._landmarks, slot, poses[slot], stripes, self._focal_px, self._config)
+                measure_slot(self._landmarks, slot, poses[slot], stripes, self._camera.focal_px, self._config)
 
     @property
     def _on_map(self) -> bool:

@@ -30,8 +30,8 @@ class FramePose:
 
 
 @numba.njit(cache=True, nogil=True)
-def _weights(rotation, translation, points, spread, sigma):  # type: ignore[no-untyped-def]
-    """Return the inverse covariances (N, 3: xx, xy, yy) of the residuals, σ² I + d dᵀ with d the depth's spread in the image.
+def _weights(rotation, translation, points, spread, whitening):  # type: ignore[no-untyped-def]
+    """Return the inverse covariances (N, 3: xx, xy, yy) of the residuals, (WᵀW)⁻¹ + d dᵀ with d the depth's spread on the rays.
 
     They are taken at the prediction and held: recomputed at every step they would reward a step away from it, where an unknown
     depth hides any error.
@@ -43,10 +43,13 @@ def _weights(rotation, translation, points, spread, sigma):  # type: ignore[no-u
         if x[2] <= 1e-6:
             continue
         d0, d1 = (d[0] - x[0] / x[2] * d[2]) / x[2], (d[1] - x[1] / x[2] * d[2]) / x[2]
-        s2 = sigma[i] * sigma[i]
+        m = whitening[i]
+        a, c = m[0, 0] * m[0, 0] + m[1, 0] * m[1, 0], m[0, 1] * m[0, 1] + m[1, 1] * m[1, 1]
+        b = m[0, 0] * m[0, 1] + m[1, 0] * m[1, 1]
         # Sherman–Morrison.
-        f = 1.0 / (s2 + d0 * d0 + d1 * d1)
-        out[i, 0], out[i, 1], out[i, 2] = (1.0 - d0 * d0 * f) / s2, -d0 * d1 * f / s2, (1.0 - d1 * d1 * f) / s2
+        q0, q1 = a * d0 + b * d1, b * d0 + c * d1
+        f = 1.0 / (1.0 + d0 * q0 + d1 * q1)
+        out[i, 0], out[i, 1], out[i, 2] = a - f * q0 * q0, b - f * q0 * q1, c - f * q1 * q1
     return out
 
 
@@ -104,7 +107,7 @@ def solve_frame_pose(
     points: FloatArray,
     spread: FloatArray,
     rays: FloatArray,
-    sigma: FloatArray,
+    whitening: FloatArray,
     cauchy: float,
     iterations: int = 10,
 ) -> FramePose:
@@ -116,12 +119,12 @@ def solve_frame_pose(
         points: (N, 3) landmarks in map.
         spread: (N, 3) one sigma of each landmark along its anchor's ray, in map.
         rays: (N, 2) observed.
-        sigma: (N,) of the rays.
+        whitening: (N, 2, 2) of the rays, see :mod:`vli_backend.track_noise`.
         cauchy: in sigmas.
         iterations: at most.
     """
     rotation, translation = np.ascontiguousarray(T_predicted[:3, :3]), np.ascontiguousarray(T_predicted[:3, 3])
-    weights = _weights(rotation, translation, points, spread, sigma)
+    weights = _weights(rotation, translation, points, spread, whitening)
     rotation, translation, h, inliers, squares, done = _solve(
         rotation, translation, points, weights, np.ascontiguousarray(rays), prior, cauchy, iterations
     )

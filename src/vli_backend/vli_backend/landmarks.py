@@ -8,15 +8,20 @@ window is never starved.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
 from vli_backend.condense import LandmarkArrays
 from vli_common.arrays import AnyArray, BoolArray, FloatArray, IntArray
+from vli_common.geometry import inverse, transform
 
 KEPT_OBSERVATIONS = 4
 """Newest slots whose observations continue as a new landmark when the anchor leaves."""
+_OF_SLOTS = ("rays", "seen", "whitening", "depth", "depth_sigma")
+"""Arrays with an entry for each slot; 0 where there is nothing."""
+_ADOPTED_SIGMA = 0.005
+"""Least relative sigma of a depth that comes from the window before."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +53,8 @@ class LandmarkTable:
             rho=np.empty(0),
             prior=np.empty((0, 2)),
             rays=np.empty((0, slots, 2)),
-            sigma=np.empty((0, slots)),
+            seen=np.empty((0, slots), np.bool_),
+            whitening=np.empty((0, slots, 2, 2)),
             depth=np.empty((0, slots)),
             depth_sigma=np.empty((0, slots)),
         )
@@ -61,7 +67,7 @@ class LandmarkTable:
     @property
     def observations(self) -> IntArray:
         """Number of keyframes that saw each landmark, the anchor included (L,)."""
-        counts: IntArray = np.count_nonzero(self.arrays.sigma > 0, axis=1)
+        counts: IntArray = np.count_nonzero(self.arrays.seen, axis=1)
         return counts
 
     @property
@@ -74,13 +80,15 @@ class LandmarkTable:
         lookup = {int(key): row for row, key in enumerate(self.ids) if self.active[row]}
         return np.array([lookup.get(int(key), -1) for key in ids], dtype=np.int64)
 
-    def add_keyframe(self, ids: IntArray, rays: FloatArray, sigma: FloatArray, restarted: BoolArray, rho_guess: float) -> None:
+    def add_keyframe(
+        self, ids: IntArray, rays: FloatArray, whitening: FloatArray, restarted: BoolArray, rho_guess: float
+    ) -> None:
         """Append a keyframe: known ids get an observation, new ones (and restarted tracks) a landmark anchored here.
 
         Args:
             ids: (N,).
             rays: (N, 2).
-            sigma: (N,) of the rays (normalised units).
+            whitening: (N, 2, 2) of the rays, see :mod:`vli_backend.track_noise`.
             restarted: (N,) True where the track's patch was taken anew since the last keyframe.
             rho_guess: first inverse depth of new landmarks, 1/m.
         """
@@ -89,9 +97,27 @@ class LandmarkTable:
         rows = self.rows_of(ids)
         self.active[rows[(rows >= 0) & restarted]] = False
         known = (rows >= 0) & ~restarted
-        self.arrays.rays[rows[known], slot] = rays[known]
-        self.arrays.sigma[rows[known], slot] = sigma[known]
-        self._append(ids[~known], slot, rays[~known], sigma[~known], np.full(np.count_nonzero(~known), rho_guess))
+        self._observe(rows[known], slot, rays[known], whitening[known])
+        self._append(ids[~known], slot, rays[~known], whitening[~known], np.full(np.count_nonzero(~known), rho_guess))
+
+    def adopt(self, landmarks: LandmarkPoints, T_map_camera: FloatArray, near_m: float) -> None:
+        """Take what a window that has just ended knew of the depths; only while this table has a single keyframe.
+
+        The prior on each depth is as wide as the old window left it, not narrower than its poses are known.
+
+        Args:
+            landmarks: of the old window.
+            T_map_camera: (4, 4) of the keyframe.
+            near_m: least depth.
+        """
+        rows = self.rows_of(landmarks.ids)
+        points = transform(inverse(T_map_camera), landmarks.positions)
+        usable = (rows >= 0) & (points[:, 2] > near_m)
+        rows, depth = rows[usable], points[usable, 2]
+        relative = np.linalg.norm(landmarks.spread[usable], axis=1) / np.linalg.norm(points[usable], axis=1)
+        self.arrays.rho[rows] = 1.0 / depth
+        self.arrays.prior[rows, 0], self.arrays.prior[rows, 1] = 1.0 / depth, np.maximum(relative, _ADOPTED_SIGMA) / depth
+        self.information[rows] = 0.0
 
     def set_depths(
         self, slot: int, rows: IntArray, inverse_depth: FloatArray, sigma: FloatArray, stripe_px: FloatArray, primary_only: bool
@@ -121,21 +147,21 @@ class LandmarkTable:
         arrays = self.arrays
         leaving = arrays.anchor == 0
         first_kept = max(1, self.frames - KEPT_OBSERVATIONS)
-        kept = arrays.sigma[:, first_kept : self.frames] > 0
+        kept = arrays.seen[:, first_kept : self.frames]
         continues = leaving & self.active & kept[:, -1] & (np.count_nonzero(kept, axis=1) >= 2)
         rows = np.flatnonzero(continues)
         anchors = first_kept + np.argmax(kept[rows], axis=1)
         old = len(self)
         rho = arrays.rho[rows]
-        self._append(self.ids[rows], anchors, arrays.rays[rows, anchors], arrays.sigma[rows, anchors], rho)
+        self._append(self.ids[rows], anchors, arrays.rays[rows, anchors], arrays.whitening[rows, anchors], rho)
         self.active[rows] = False
         window = slice(first_kept, self.slots)
-        for name in ("rays", "sigma", "depth", "depth_sigma"):
+        for name in _OF_SLOTS:
             table = getattr(self.arrays, name)
             table[old:, window] = table[rows, window]
         self.stripe[old:, window] = self.stripe[rows, window]
         self.information[old:] = self.information[rows]
-        self.arrays.sigma[rows, window] = 0.0
+        self.arrays.seen[rows, window] = False
         self.arrays.depth_sigma[rows, window] = 0.0
         return np.concatenate([leaving, np.zeros(len(rows), np.bool_)])
 
@@ -144,10 +170,10 @@ class LandmarkTable:
         self._keep(~leaving)
         arrays = self.arrays
         arrays.anchor -= 1
-        for name, empty in (("rays", 0.0), ("sigma", 0.0), ("depth", 0.0), ("depth_sigma", 0.0)):
+        for name in _OF_SLOTS:
             table = getattr(arrays, name)
             table[:, :-1] = table[:, 1:].copy()
-            table[:, -1] = empty
+            table[:, -1] = 0
         self.stripe[:, :-1] = self.stripe[:, 1:].copy()
         self.stripe[:, -1] = np.inf
         self.frames -= 1
@@ -175,7 +201,7 @@ class LandmarkTable:
         self.active[lost] = False
         self._keep(self.active | (self.observations >= 2))
 
-    def _append(self, ids: IntArray, anchors: AnyArray | int, rays: FloatArray, sigma: FloatArray, rho: FloatArray) -> None:
+    def _append(self, ids: IntArray, anchors: AnyArray | int, rays: FloatArray, whitening: FloatArray, rho: FloatArray) -> None:
         count, old = len(ids), len(self)
         arrays = self.arrays
         self.ids = np.concatenate([self.ids, ids])
@@ -184,14 +210,17 @@ class LandmarkTable:
         arrays.anchor_ray = np.concatenate([arrays.anchor_ray, rays])
         arrays.rho = np.concatenate([arrays.rho, rho])
         arrays.prior = np.concatenate([arrays.prior, np.stack([rho, self._spread * rho], axis=1)])
-        arrays.rays = np.concatenate([arrays.rays, np.zeros((count, self.slots, 2))])
-        for name in ("sigma", "depth", "depth_sigma"):
-            setattr(arrays, name, np.concatenate([getattr(arrays, name), np.zeros((count, self.slots))]))
+        for name in _OF_SLOTS:
+            table = getattr(arrays, name)
+            setattr(arrays, name, np.concatenate([table, np.zeros((count, *table.shape[1:]), table.dtype)]))
         self.stripe = np.concatenate([self.stripe, np.full((count, self.slots), np.inf)])
         self.information = np.concatenate([self.information, np.full(count, 0.0)])
-        rows = np.arange(old, old + count)
-        arrays.rays[rows, anchors] = rays
-        arrays.sigma[rows, anchors] = sigma
+        self._observe(np.arange(old, old + count), anchors, rays, whitening)
+
+    def _observe(self, rows: IntArray, slots: AnyArray | int, rays: FloatArray, whitening: FloatArray) -> None:
+        self.arrays.rays[rows, slots] = rays
+        self.arrays.seen[rows, slots] = True
+        self.arrays.whitening[rows, slots] = whitening
 
     def _keep(self, mask: BoolArray) -> None:
         arrays = self.arrays
@@ -201,5 +230,5 @@ class LandmarkTable:
             self.stripe[mask],
             self.information[mask],
         )
-        for name in ("anchor", "anchor_ray", "rho", "prior", "rays", "sigma", "depth", "depth_sigma"):
-            setattr(arrays, name, np.ascontiguousarray(getattr(arrays, name)[mask]))
+        for field in fields(arrays):
+            setattr(arrays, field.name, np.ascontiguousarray(getattr(arrays, field.name)[mask]))

@@ -135,7 +135,7 @@ def measure_slot(
     back = inverse(T_map_camera)
     points = np.concatenate([transform(back @ pose, scan.points) for pose, scan in stripes])
     sigma = np.concatenate([scan.sigma for _, scan in stripes])
-    rows = np.flatnonzero(table.arrays.sigma[:, slot] > 0)
+    rows = np.flatnonzero(table.arrays.seen[:, slot])
     rays = table.arrays.rays[rows, slot]
     found = laser_depths(rays, points, sigma, focal_px, config.depth_radius_px, config.depth_min_points, config.depth_max_rms)
     good = np.isfinite(found.inverse_depth)

@@ -14,9 +14,11 @@ from vli_backend.frame_pose import solve_frame_pose
 from vli_backend.initialisation import bundle_adjust, chain_rotations
 from vli_backend.landmarks import LandmarkTable
 from vli_backend.laser_depth import measure_slot
+from vli_backend.track_noise import whitening
 from vli_backend.window import FrameRecord, Window, close_interval
 from vli_common.arrays import FloatArray
 from vli_common.calibration import Calibration
+from vli_common.camera import CameraModel
 from vli_common.geometry import pose
 from vli_common.types import LaserScan, Tracks
 
@@ -61,7 +63,7 @@ def structure_from_motion(
     table = LandmarkTable(max(len(tracks), 2))
     guess = 1.0 / float(np.median(np.concatenate([scan.points[:, 2] for scan in scans])))
     limits = (guess / 6.0, guess * 6.0)
-    poses = chain_keyframes(table, config, tracks, rotations, guess, focal, limits)
+    poses = chain_keyframes(table, config, tracks, rotations, guess, calibration.camera, limits)
     use = table.usable
 
     def linearise(T_world_camera: FloatArray) -> Quadratic:
@@ -96,13 +98,13 @@ def chain_keyframes(
     tracks: list[Tracks],
     rotations: FloatArray,
     guess: float,
-    focal: float,
+    camera: CameraModel,
     limits: tuple[float, float],
 ) -> FloatArray:
     """Return camera poses (K, 4, 4) by PnP from keyframe to keyframe; the landmarks' depths follow each step."""
     poses = [np.eye(4)]
     for k, track in enumerate(tracks):
-        sigma = np.hypot(track.sigma_px, config.pixel_sigma) / focal
+        white = whitening(camera, track, config.pixel_sigma)
         if k > 0:
             predicted = pose(poses[-1][:3, :3] @ rotations[k - 1].T @ rotations[k], poses[-1][:3, 3])
             rows = table.rows_of(track.ids)
@@ -113,10 +115,10 @@ def chain_keyframes(
             directions = np.einsum("nij,nj->ni", anchors[:, :3, :3], rays) / arrays.rho[rows[seen], None]
             prior = np.diag(np.repeat([0.02**-2, guess**2], 3))
             found = solve_frame_pose(
-                predicted, prior, directions + anchors[:, :3, 3], 0.1 * directions, track.rays[seen], sigma[seen], 2.0
+                predicted, prior, directions + anchors[:, :3, 3], 0.1 * directions, track.rays[seen], white[seen], 2.0
             )
             poses.append(found.T_map_camera)
-        table.add_keyframe(track.ids, track.rays, sigma, np.zeros(len(track), np.bool_), guess)
+        table.add_keyframe(track.ids, track.rays, white, np.zeros(len(track), np.bool_), guess)
         refine(table.arrays, np.stack(poses), table.usable, config.cauchy, limits)
     return np.stack(poses)
 

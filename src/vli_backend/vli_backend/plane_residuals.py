@@ -52,7 +52,8 @@ def plane_residuals(
         arrays.rho[chosen].copy(),
         arrays.prior[chosen],
         arrays.rays[chosen],
-        arrays.sigma[chosen],
+        arrays.seen[chosen],
+        arrays.whitening[chosen],
         arrays.depth[chosen],
         np.zeros_like(arrays.depth_sigma[chosen]),
     )

@@ -26,8 +26,10 @@ from vli_backend.landmarks import LandmarkTable
 from vli_backend.motion_start import chain_keyframes, parallax_px
 from vli_backend.preintegrations import measurements_of
 from vli_backend.smoother import KeyframeState
+from vli_backend.track_noise import whitening
 from vli_common.arrays import FloatArray
 from vli_common.calibration import Calibration
+from vli_common.camera import CameraModel
 from vli_common.geometry import interpolate, inverse, pose, rotation_between
 from vli_common.types import FrontEndOutput, Tracks
 
@@ -74,13 +76,13 @@ def start_from_vision(
     """
     tracks = [first, *(interval[-1].tracks for interval in intervals)]
     T_cam_imu = calibration.T_cam_imu if calibration.T_cam_imu is not None else np.eye(4)
-    focal = calibration.camera.focal_px
+    camera = calibration.camera
     rotations = chain_rotations([measurements_of(interval[-1].preintegration) for interval in intervals], T_cam_imu)
-    parallax = parallax_px(tracks, rotations, focal)
+    parallax = parallax_px(tracks, rotations, camera.focal_px)
     if parallax < config.start_parallax_px:
         return _failed(f"{parallax:.0f} px of parallax, {config.start_parallax_px:.0f} are needed: move sideways")
-    table, poses = _structure(config, tracks, rotations, guess_m, focal)
-    visual = [_interval(config, table, poses, k, tracks[k], interval, T_cam_imu, focal) for k, interval in enumerate(intervals)]
+    table, poses = _structure(config, tracks, rotations, guess_m, camera)
+    visual = [_interval(config, table, poses, k, tracks[k], interval, T_cam_imu, camera) for k, interval in enumerate(intervals)]
     depth = float(np.median(1.0 / table.arrays.rho[table.usable]))
     T_world_keyframe = pose(poses[:, :3, :3] @ T_cam_imu[:3, :3], poses[:, :3, 3])
     sigmas = alignment_sigmas(calibration, config, depth)
@@ -91,12 +93,12 @@ def start_from_vision(
 
 
 def _structure(
-    config: BackEndConfig, tracks: list[Tracks], rotations: FloatArray, guess_m: float, focal: float
+    config: BackEndConfig, tracks: list[Tracks], rotations: FloatArray, guess_m: float, camera: CameraModel
 ) -> tuple[LandmarkTable, FloatArray]:
     """Return landmarks and camera poses (K, 4, 4) up to scale: chained by PnP, then adjusted."""
     table = LandmarkTable(max(len(tracks), 2))
     limits = (1.0 / (10.0 * guess_m), 10.0 / guess_m)
-    poses = chain_keyframes(table, config, tracks, rotations, 1.0 / guess_m, focal, limits)
+    poses = chain_keyframes(table, config, tracks, rotations, 1.0 / guess_m, camera, limits)
     use = table.usable
 
     def linearise(T_world_camera: FloatArray) -> Quadratic:
@@ -116,7 +118,7 @@ def _interval(
     keyframe: Tracks,
     frames: list[FrontEndOutput],
     T_cam_imu: FloatArray,
-    focal: float,
+    camera: CameraModel,
 ) -> VisualInterval:
     """Return the frames between keyframes k and k + 1 with poses from the landmarks."""
     points = table.all_points(poses)
@@ -126,10 +128,10 @@ def _interval(
     for frame in frames[:-1]:
         tracks = frame.tracks
         _, rows, columns = np.intersect1d(points.ids, tracks.ids, return_indices=True)
-        sigma = np.hypot(tracks.sigma_px[columns], config.pixel_sigma) / focal
+        white = whitening(camera, tracks, config.pixel_sigma)[columns]
         predicted = interpolate(poses[k], poses[k + 1], (tracks.stamp_ns - keyframe.stamp_ns) / span)
         solved = solve_frame_pose(
-            predicted, prior, points.positions[rows], points.spread[rows], tracks.rays[columns], sigma, config.cauchy
+            predicted, prior, points.positions[rows], points.spread[rows], tracks.rays[columns], white, config.cauchy
         )
         found.append(solved.T_map_camera)
     T = np.stack([*found, poses[k + 1]])

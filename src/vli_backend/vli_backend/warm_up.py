@@ -22,8 +22,9 @@ def warm_up() -> None:
     table = LandmarkTable(config.window_keyframes + 1)
     rays = rng.uniform(-0.3, 0.3, (20, 2))
     ids, restarted = np.arange(1, 21, dtype=np.int64), np.zeros(20, np.bool_)
+    whitening = np.tile(1e3 * np.eye(2), (20, 1, 1))
     for _ in range(2):
-        table.add_keyframe(ids, rays, np.full(20, 1e-3), restarted, 30.0)
+        table.add_keyframe(ids, rays, whitening, restarted, 30.0)
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[1, 0, 3] = 0.001
     directions = np.concatenate([rng.uniform(-0.3, 0.3, (50, 2)), np.ones((50, 1))], axis=1)
@@ -32,7 +33,7 @@ def warm_up() -> None:
     refine(table.arrays, poses, table.usable, 1.0, (2.0, 150.0))
     condense(table.arrays, poses, table.usable, 1.0).in_body_frame(np.eye(4))
     found = table.points(poses)
-    solve_frame_pose(poses[0], np.eye(6), found.positions, found.spread, rays, np.full(20, 1e-3), 1.0)
+    solve_frame_pose(poses[0], np.eye(6), found.positions, found.spread, rays, whitening, 1.0)
     _warm_up_map(poses, scan)
 
 

@@ -28,7 +28,8 @@ def _problem(seed: int = 0, slots: int = 4, count: int = 12, noise: float = 1e-3
         1 / local[rows, anchor, 2],
         np.tile([30.0, 20.0], (count, 1)),
         rays,
-        np.full((count, slots), 1.4e-3),
+        np.ones((count, slots), np.bool_),
+        700.0 * np.eye(2) + np.random.default_rng(9).normal(scale=100.0, size=(count, slots, 2, 2)),
         1 / local[..., 2] + rng.normal(scale=0.05, size=(count, slots)),
         depth_sigma,
     )
@@ -46,7 +47,7 @@ def _cost(arrays: LandmarkArrays, poses: FloatArray, cauchy: float) -> float:
         for j in range(len(poses)):
             local = transform(inverse(poses[j]) @ poses[a], point[None])[0]
             if j != a:
-                squared = float((((local[:2] / local[2] - arrays.rays[i, j]) / arrays.sigma[i, j]) ** 2).sum())
+                squared = float(((arrays.whitening[i, j] @ (local[:2] / local[2] - arrays.rays[i, j])) ** 2).sum())
                 total += cauchy**2 * np.log1p(squared / cauchy**2)
             if arrays.depth_sigma[i, j] > 0:
                 squared = float(((1 / local[2] - arrays.depth[i, j]) / arrays.depth_sigma[i, j]) ** 2)
@@ -70,7 +71,7 @@ def test_the_gradient_is_that_of_the_cost_at_optimal_depths(cauchy: float) -> No
         step = np.zeros(len(numeric))
         step[k] = 1e-6
         numeric[k] = (_cost(arrays, _moved(poses, step), cauchy) - _cost(arrays, _moved(poses, -step), cauchy)) / 4e-6
-    np.testing.assert_allclose(quadratic.gradient, numeric, atol=2e-4 * np.abs(numeric).max())
+    np.testing.assert_allclose(quadratic.gradient, numeric, atol=5e-4 * np.abs(numeric).max())
 
 
 def test_the_constant_is_the_cost() -> None:

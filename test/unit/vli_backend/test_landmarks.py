@@ -14,7 +14,7 @@ def _add(table: LandmarkTable, ids: list[int], restarted: list[int] | None = Non
     keys: IntArray = np.array(ids, np.int64)
     rays = np.stack([keys * 0.01, np.full(len(keys), table.frames * 0.1)], axis=1)
     table.forget_lost(keys)
-    table.add_keyframe(keys, rays, np.full(len(keys), 1e-3), np.isin(keys, restarted or []), RHO)
+    table.add_keyframe(keys, rays, np.tile(1e3 * np.eye(2), (len(keys), 1, 1)), np.isin(keys, restarted or []), RHO)
 
 
 def test_a_feature_seen_twice_is_usable_and_anchored_at_the_first_sight() -> None:
@@ -76,10 +76,10 @@ def test_a_split_counts_every_observation_once() -> None:
     table = LandmarkTable(9)
     for _ in range(9):
         _add(table, [1])
-    before = int(np.count_nonzero(table.arrays.sigma))
+    before = int(np.count_nonzero(table.arrays.seen))
     leaving = table.split()
     assert list(leaving) == [True, False]
-    assert int(np.count_nonzero(table.arrays.sigma)) == before
+    assert int(np.count_nonzero(table.arrays.seen)) == before
     assert table.observations[1] == KEPT_OBSERVATIONS
     assert table.arrays.anchor[1] == 9 - KEPT_OBSERVATIONS
 
@@ -112,4 +112,4 @@ def test_dropping_the_oldest_moves_all_slots_down() -> None:
     row = int(table.rows_of(np.array([3]))[0])
     assert table.arrays.anchor[row] == 0
     np.testing.assert_allclose(table.arrays.rays[row, :3, 1], [0.1, 0.2, 0.3])
-    assert (table.arrays.sigma[:, 3] == 0).all()
+    assert not table.arrays.seen[:, 3].any()

@@ -75,7 +75,7 @@ def _table(depth_factor: float) -> tuple[LandmarkTable, FloatArray]:
     table, ids = LandmarkTable(6), np.arange(1, 31)
     for T in poses:
         seen = points - T[:3, 3]
-        table.add_keyframe(ids, seen[:, :2] / seen[:, 2:], np.full(30, 1e-4), np.zeros(30, np.bool_), 30.0)
+        table.add_keyframe(ids, seen[:, :2] / seen[:, 2:], np.tile(1e4 * np.eye(2), (30, 1, 1)), np.zeros(30, np.bool_), 30.0)
     inverse_depth = 1.0 / (depth_factor * points[:, 2])
     table.set_depths(2, np.arange(30), inverse_depth, np.full(30, 0.01), np.ones(30), True)
     refine(table.arrays, poses, table.usable, 1.0, (2.0, 150.0), 20)

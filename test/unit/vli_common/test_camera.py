@@ -37,6 +37,15 @@ def test_every_pixel_of_the_image_comes_back_from_its_ray(lens: str) -> None:
 
 
 @pytest.mark.parametrize("lens", LENSES)
+def test_the_jacobian_tells_where_a_ray_goes_when_it_turns_a_little(lens: str) -> None:
+    camera = camera_of(lens)
+    rays, step = camera.unproject(every_pixel()[::997]), np.array([3e-5, -2e-5])
+    np.testing.assert_allclose(
+        np.einsum("nij,j->ni", camera.jacobian(rays), step), camera.to_pixels(rays + step) - camera.to_pixels(rays), atol=2e-6
+    )
+
+
+@pytest.mark.parametrize("lens", LENSES)
 def test_points_fall_on_the_pixels_that_opencv_gives(lens: str) -> None:
     camera = camera_of(lens)
     rays = camera.unproject(every_pixel()[::97])
