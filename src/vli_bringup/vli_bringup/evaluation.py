@@ -74,13 +74,14 @@ class MapResult:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """Figures, and what the plots are drawn from."""
+    """Figures, what the plots are drawn from, and what is to be said of them."""
 
     figures: Evaluation
     live: TrajectoryErrors
     final: TrajectoryErrors | None
     passes_ns: IntArray
     map: MapResult | None
+    notes: tuple[str, ...] = ()
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -110,16 +111,23 @@ def run(args: argparse.Namespace) -> int:
         InputError: an input is missing or unusable, or run and truth do not overlap in time.
         OutputError: the report cannot be written.
     """
-    result = evaluate(find_sources(args), args.poses_from)
+    sources = find_sources(args)
+    result = evaluate(sources, args.poses_from)
     text = as_text(result.figures)
-    sys.stdout.write(text)
     _write(result, text, args.directory / "eval", args.json)
-    _note(f"report and plots are in '{args.directory / 'eval'}'")
+    found = [getattr(sources, name) for name in _NEXT_TO_TRUTH if getattr(args, name) is None]
+    sys.stdout.write(text)
+    for note in (
+        *(f"used '{path}', next to the truth" for path in found if path is not None),
+        *result.notes,
+        f"report and plots are in '{args.directory / 'eval'}'",
+    ):
+        sys.stderr.write(f"vli eval: {note}\n")
     return 0
 
 
 def find_sources(args: argparse.Namespace) -> Sources:
-    """Return the inputs as given, else those that stand next to the truth, and say so.
+    """Return the inputs as given, else those that stand next to the truth.
 
     Raises:
         InputError: DIR is not the output of a run.
@@ -133,7 +141,6 @@ def find_sources(args: argparse.Namespace) -> Sources:
         paths[name] = getattr(args, name)
         beside = args.truth.parent / file_name
         if paths[name] is None and beside.is_file():
-            _note(f"using '{beside}', next to the truth")
             paths[name] = beside
     return Sources(args.directory, args.truth, **paths)
 
@@ -146,9 +153,10 @@ def evaluate(sources: Sources, poses_from_s: float = STARTUP_S) -> Result:
     """
     truth = read_tum(sources.truth)
     passes = read_passes(sources.passes) if sources.passes else np.empty((0, 2), dtype=np.int64)
+    notes: list[str] = []
     live = read_tum(sources.run / "trajectory.tum")
     live_pairs = associate(live, truth)
-    final_pairs = _final_pairs(sources.run, truth)
+    final_pairs = _final_pairs(sources.run, truth, notes)
     reference = final_pairs or live_pairs
     T_truth_map = align_poses(reference.estimate, reference.truth)
 
@@ -158,15 +166,15 @@ def evaluate(sources: Sources, poses_from_s: float = STARTUP_S) -> Result:
 
     live_errors, live_figures = figures(live_pairs)
     final_errors, final_figures = figures(final_pairs) if final_pairs else (None, None)
-    cloud = _read_map(sources.run)
+    cloud = _read_map(sources.run, notes)
     if cloud is not None and sources.seen:
-        _note_compensation(sources.run)
+        _note_compensation(sources.run, notes)
     mapped, surface, completeness = _compare_map(cloud, T_truth_map, sources)
     share = poses_share(live.stamps_ns, truth.stamps_ns, poses_from_s)
     run_figures = _run_figures(sources.run, share, poses_from_s, None if cloud is None else len(cloud))
     consistency = _consistency(sources.run, live_pairs)
     figures_of_run = Evaluation(run_figures, live_figures, final_figures, surface, completeness, consistency)
-    return Result(figures_of_run, live_errors, final_errors, passes, mapped)
+    return Result(figures_of_run, live_errors, final_errors, passes, mapped, tuple(notes))
 
 
 def _consistency(directory: Path, pairs: Association) -> ConsistencyFigures:
@@ -174,27 +182,29 @@ def _consistency(directory: Path, pairs: Association) -> ConsistencyFigures:
     return consistency_figures(pairs, *read_covariances(path)) if path.is_file() else ConsistencyFigures()
 
 
-def _final_pairs(directory: Path, truth: Trajectory) -> Association | None:
+def _final_pairs(directory: Path, truth: Trajectory, notes: list[str]) -> Association | None:
     path = directory / "trajectory_final.tum"
     if path.is_file():
         return associate(read_tum(path), truth)
-    _note(f"'{path}' does not exist: the live trajectory aligns rotation and map")
+    notes.append(f"'{path}' does not exist: the live trajectory aligns rotation and map")
     return None
 
 
-def _read_map(directory: Path) -> PointCloud | None:
+def _read_map(directory: Path, notes: list[str]) -> PointCloud | None:
     path = directory / "map.ply"
     if path.is_file():
         return read_cloud(path)
-    _note(f"'{path}' does not exist: no figures of a map")
+    notes.append(f"'{path}' does not exist: no figures of a map")
     return None
 
 
-def _note_compensation(directory: Path) -> None:
-    """Say that colours which the light was taken out of are not those that were seen."""
+def _note_compensation(directory: Path, notes: list[str]) -> None:
+    """Note that colours which the light was taken out of are not those that were seen."""
     path = directory / CONFIG
     if path.is_file() and load_settings(path).mapping.colour == "compensated":
-        _note("the light is taken out of the map's colours: for a figure against the colours as seen, run with --colour lit")
+        notes.append(
+            "the light is taken out of the map's colours: for a figure against the colours as seen, run with --colour lit"
+        )
 
 
 def _compare_map(
@@ -237,7 +247,3 @@ def _write(result: Result, text: str, directory: Path, json_path: Path | None) -
         write_plots(result, directory)
     except OSError as error:
         raise OutputError(f"the report cannot be written ({error}), expected a directory that can be written to") from error
-
-
-def _note(text: str) -> None:
-    sys.stderr.write(f"vli eval: {text}\n")

@@ -65,12 +65,17 @@ def arguments_of(scan: Path, *arguments: str) -> list[str]:
     return [str(scan / "run"), "--truth", str(scan / "truth" / "truth.tum"), *arguments]
 
 
-def figures_of(scan: Path, *arguments: str) -> dict[str, float]:
-    """Return the figures without drawing plots; what could not be computed is NaN, for comparisons."""
+def result_of(scan: Path, *arguments: str) -> evaluation.Result:
+    """Return the result without drawing plots."""
     parser = argparse.ArgumentParser()
     evaluation.add_arguments(parser)
     args = parser.parse_args(arguments_of(scan, *arguments))
-    figures = as_dict(evaluation.evaluate(evaluation.find_sources(args), args.poses_from).figures)
+    return evaluation.evaluate(evaluation.find_sources(args), args.poses_from)
+
+
+def figures_of(scan: Path, *arguments: str) -> dict[str, float]:
+    """Return the figures; what could not be computed is NaN, for comparisons."""
+    figures = as_dict(result_of(scan, *arguments).figures)
     return {key: math.nan if value is None else value for key, value in figures.items()}
 
 
@@ -112,7 +117,7 @@ def test_rotation_and_map_are_aligned_by_the_final_trajectory(scan: Path) -> Non
     assert after["translation_rmse_mm"] == pytest.approx(0, abs=1e-6)
 
 
-def test_without_a_final_trajectory_the_live_one_aligns_and_it_is_said(scan: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_a_final_trajectory_the_live_one_aligns_and_it_is_said(scan: Path) -> None:
     (scan / "run" / "trajectory_final.tum").unlink()
     figures = figures_of(scan)
     assert math.isnan(figures["final_translation_rmse_mm"])
@@ -121,21 +126,23 @@ def test_without_a_final_trajectory_the_live_one_aligns_and_it_is_said(scan: Pat
     T = align_poses(live.poses, truth.poses[40::2]) @ T_MAP_TRUTH
     assert np.abs(T - np.eye(4)).max() > 1e-4  # the alignment does differ from the true one
     assert figures["map_point_to_plane_rmse_mm"] != pytest.approx(1e3 * HEIGHT, abs=1e-3)
-    assert "trajectory_final.tum' does not exist: the live trajectory aligns" in capsys.readouterr().err
+    (note,) = result_of(scan).notes
+    assert "trajectory_final.tum' does not exist: the live trajectory aligns" in note
 
 
 def test_what_stands_next_to_the_truth_is_used_and_said(scan: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert evaluate(scan) == 0
     said = capsys.readouterr().err
     for name in ("surface.ply", "seen.ply", "passes.json"):
-        assert f"using '{scan / 'truth' / name}', next to the truth" in said
+        assert f"used '{scan / 'truth' / name}', next to the truth" in said
 
 
 def test_what_is_given_goes_before_what_stands_there(scan: Path, capsys: pytest.CaptureFixture[str]) -> None:
     elsewhere = scan / "other.ply"
     ply.write_cloud(elsewhere, cloud_of(floor(500) + np.array([0, 0, 0.3]), GREY))
-    assert figures_of(scan, "--seen", str(elsewhere))["completeness_percent"] == 0
+    assert evaluate(scan, "--seen", str(elsewhere)) == 0
     assert "seen.ply" not in capsys.readouterr().err
+    assert figures_of(scan, "--seen", str(elsewhere))["completeness_percent"] == 0
 
 
 def test_the_truth_alone_is_enough(scan: Path) -> None:
@@ -150,7 +157,7 @@ def test_the_truth_alone_is_enough(scan: Path) -> None:
     assert not (scan / "run" / "eval" / "map.png").exists()
 
 
-def test_a_run_without_a_map_has_the_figures_of_its_trajectory(scan: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_without_a_map_has_the_figures_of_its_trajectory(scan: Path) -> None:
     complete = figures_of(scan)
     (scan / "run" / "map.ply").unlink()
     figures = figures_of(scan)
@@ -158,7 +165,8 @@ def test_a_run_without_a_map_has_the_figures_of_its_trajectory(scan: Path, capsy
     assert figures["translation_rmse_mm"] == complete["translation_rmse_mm"]
     assert math.isnan(figures["points"])
     assert math.isnan(figures["completeness_percent"])
-    assert "no figures of a map" in capsys.readouterr().err
+    (note,) = result_of(scan).notes
+    assert "no figures of a map" in note
 
 
 def test_an_empty_map_covers_nothing(scan: Path) -> None:
@@ -274,7 +282,7 @@ def test_a_bad_input_is_one_line_and_exit_code_2(
     damage(scan)
     assert evaluate(scan) == 2
     output = capsys.readouterr()
-    lines = [line for line in output.err.splitlines() if not line.startswith("vli eval: using")]
+    lines = output.err.splitlines()
     assert output.out == ""
     assert len(lines) == 1
     assert message in lines[0]
