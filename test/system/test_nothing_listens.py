@@ -19,6 +19,7 @@ pytestmark = pytest.mark.graph
 _ON_LOOPBACK = 4
 """Sockets of a participant: discovery, data, and one to send from, at the least."""
 _START_S = 60.0
+_RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 _GROUP = ipaddress.ip_address("239.255.0.1")
 """Of DDS, for discovery."""
 # Two more interfaces, with addresses of their own: a node that listened on everything would be found there.
@@ -64,11 +65,11 @@ def can_have_namespaces() -> bool:
     return subprocess.run(probe, check=False, capture_output=True).returncode == 0
 
 
-@pytest.fixture(scope="module")
-def node() -> Iterator[tuple[int, bool]]:
-    """Return the process id of a node with nothing set, and whether it is in a network namespace of its own."""
-    unset = ("ROS_AUTOMATIC_DISCOVERY_RANGE", "FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
-    environment = {name: value for name, value in os.environ.items() if name not in unset}
+@pytest.fixture(scope="module", params=[{}, {_RANGE: "LOCALHOST"}], ids=["nothing set", "LOCALHOST"])
+def node(request: pytest.FixtureRequest) -> Iterator[tuple[int, bool]]:
+    """Return the process id of a node with this environment, and whether it is in a network namespace of its own."""
+    unset = (_RANGE, "FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
+    environment = {name: value for name, value in os.environ.items() if name not in unset} | request.param
     isolated = can_have_namespaces()
     inside = ["unshare", "--net", "sh", "-c", _ANOTHER_INTERFACE, "sh"] if isolated else []
     process = subprocess.Popen([*inside, sys.executable, "-m", "vli_driver.nodes.driver_node"], env=environment)

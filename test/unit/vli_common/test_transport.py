@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import fcntl
+import os
 import re
 from pathlib import Path
 
 import pytest
 
-from vli_common.node.transport import LOCAL_PROFILE, remove_dead_segments, use_fresh_ports
+from vli_common.node.transport import LOCAL_PROFILE, remove_dead_segments, set_transport_profile, use_fresh_ports
+
+_PROFILE, _RANGE = "FASTRTPS_DEFAULT_PROFILES_FILE", "ROS_AUTOMATIC_DISCOVERY_RANGE"
 
 
 def test_shared_memory_of_the_dead_is_removed_and_that_of_the_living_is_not(tmp_path: Path) -> None:
@@ -27,16 +30,36 @@ def test_a_node_started_again_has_ports_of_its_own_unless_the_profile_is_foreign
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("FASTDDS_DEFAULT_PROFILES_FILE", raising=False)
-    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", str(LOCAL_PROFILE))
+    monkeypatch.setenv(_PROFILE, str(LOCAL_PROFILE))
+    monkeypatch.delenv(_RANGE, raising=False)
     offsets: list[int] = []
     for number in range(1, 6):
         ((variable, profile),) = use_fresh_ports(tmp_path, number).items()
-        assert variable == "FASTRTPS_DEFAULT_PROFILES_FILE"
+        assert variable == _PROFILE
         text = Path(profile).read_text()
         offsets += map(int, re.findall("<offsetd3>([0-9]+)</offsetd3>", text))
         assert re.sub("<port>.*</port>", "", text) == LOCAL_PROFILE.read_text()
     assert len(set(offsets)) == 5
     # Odd, since even ones are for discovery, and none is the first's.
     assert all(offset % 2 and 11 < offset < 250 for offset in offsets)
-    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", "/my/own.xml")
+    monkeypatch.setenv(_PROFILE, "/my/own.xml")
     assert use_fresh_ports(tmp_path, 1) == {}
+
+
+@pytest.mark.parametrize(("asked", "given"), [("LOCALHOST", "SYSTEM_DEFAULT"), ("OFF", "OFF"), ("SUBNET", "SUBNET")])
+def test_who_asks_for_this_machine_alone_gets_the_profile_which_has_nothing_else_and_no_transports_of_rmw_beside_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, asked: str, given: str
+) -> None:
+    monkeypatch.delenv("FASTDDS_DEFAULT_PROFILES_FILE", raising=False)
+    monkeypatch.setenv(_PROFILE, "")
+    monkeypatch.setenv(_RANGE, asked)
+    assert use_fresh_ports(tmp_path, 1).get(_RANGE, asked) == given
+    set_transport_profile()
+    assert (os.environ[_PROFILE], os.environ[_RANGE]) == (str(LOCAL_PROFILE), given)
+
+
+def test_a_foreign_profile_and_the_range_beside_it_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(_PROFILE, "/my/own.xml")
+    monkeypatch.setenv(_RANGE, "LOCALHOST")
+    set_transport_profile()
+    assert (os.environ[_PROFILE], os.environ[_RANGE]) == ("/my/own.xml", "LOCALHOST")

@@ -14,6 +14,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from vli_common.topics import Topic
 
 _PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
+_RANGE_VARIABLE, _LOCALHOST, _AS_THE_PROFILE_SAYS = "ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST", "SYSTEM_DEFAULT"
 _READER_FACTOR = 8
 _SEGMENT_LOCK = re.compile(r"fastrtps_[0-9a-f]{16}_el")
 _FIRST_PORT, _PORT_STEP, _PORT_STEPS = 11, 32, 7
@@ -22,10 +23,10 @@ LOCAL_PROFILE = Path(__file__).with_name("fastdds_local.xml")
 NETWORK_PROFILE = Path(__file__).with_name("fastdds_network.xml")
 
 
-def set_transport_profile(profile: Path = LOCAL_PROFILE) -> None:
-    """Let Fast DDS use ``profile`` unless the environment names one already; call before ``rclpy.init``."""
-    if not any(os.environ.get(name) for name in _PROFILE_VARIABLES):
-        os.environ[_PROFILE_VARIABLES[0]] = str(profile)
+def set_transport_profile() -> None:
+    """Let Fast DDS use :data:`LOCAL_PROFILE` unless the environment names another; call before ``rclpy.init``."""
+    if _is_profile_ours():
+        os.environ.update(_environment(LOCAL_PROFILE))
 
 
 def use_fresh_ports(directory: Path, number: int) -> dict[str, str]:
@@ -38,12 +39,26 @@ def use_fresh_ports(directory: Path, number: int) -> dict[str, str]:
         directory: for the profile.
         number: of the start; another one each time.
     """
-    if any(os.environ.get(name, "") not in ("", str(LOCAL_PROFILE)) for name in _PROFILE_VARIABLES):
+    if not _is_profile_ours():
         return {}
     ports = f"<port><offsetd3>{_FIRST_PORT + _PORT_STEP * (number % _PORT_STEPS)}</offsetd3></port>"
     profile = directory / f"ports{number}.xml"
     profile.write_text(LOCAL_PROFILE.read_text().replace("</rtps>", f"{ports}</rtps>"))
-    return {_PROFILE_VARIABLES[0]: str(profile)}
+    return _environment(profile)
+
+
+def _is_profile_ours() -> bool:
+    return all(os.environ.get(name, "") in ("", str(LOCAL_PROFILE)) for name in _PROFILE_VARIABLES)
+
+
+def _environment(profile: Path) -> dict[str, str]:
+    """Return the variables that have a process use ``profile``, which is :data:`LOCAL_PROFILE` or made of it."""
+    variables = {_PROFILE_VARIABLES[0]: str(profile)}
+    if os.environ.get(_RANGE_VARIABLE) == _LOCALHOST:
+        # The profile has the loopback interface only. For LOCALHOST, rmw adds transports of its own, with sockets on every
+        # interface, and has each announcement go out twice to 32 ports instead of once to the group.
+        variables[_RANGE_VARIABLE] = _AS_THE_PROFILE_SAYS
+    return variables
 
 
 def remove_dead_segments(directory: Path = Path("/dev/shm")) -> int:
