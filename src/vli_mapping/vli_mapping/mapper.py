@@ -222,7 +222,7 @@ class Mapper:
         """Merge one scan into the map; return the map points (K,) it touched."""
         seen = _stripe(item)
         stripe, left = contradict(self.map, seen)
-        self._change.add(int(seen.solid.sum()), int((seen.solid & ~stripe.solid).sum()))
+        self._change.add(seen.solid, seen.solid & ~stripe.solid)
         target = self.map.insert(stripe)
         touched = np.unique(target[target >= 0])
         self._entered_ns = item.scan.stamp_ns
