@@ -5,11 +5,21 @@ from __future__ import annotations
 import fcntl
 import os
 import re
+import socket
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from vli_common.node.transport import LOCAL_PROFILE, remove_dead_segments, set_transport_profile, use_fresh_ports
+from vli_common.node.transport import (
+    NETWORK_PROFILE,
+    SHARED_MEMORY_PROFILE,
+    UDP_PROFILE,
+    local_profile,
+    remove_dead_segments,
+    set_transport_profile,
+    use_fresh_ports,
+)
 
 _PROFILE, _RANGE = "FASTRTPS_DEFAULT_PROFILES_FILE", "ROS_AUTOMATIC_DISCOVERY_RANGE"
 
@@ -26,11 +36,44 @@ def test_shared_memory_of_the_dead_is_removed_and_that_of_the_living_is_not(tmp_
     assert remove_dead_segments(tmp_path / "none") == 0
 
 
+@pytest.fixture(autouse=True)
+def asked_anew() -> Iterator[None]:
+    """What the machine grants is remembered by a process, which is not to remember what a test made of it."""
+    local_profile.cache_clear()
+    yield
+    local_profile.cache_clear()
+
+
+@pytest.mark.parametrize(("allowed", "profile"), [(212_992, SHARED_MEMORY_PROFILE), (4_194_304, UDP_PROFILE)])
+def test_udp_is_for_machines_whose_sockets_may_hold_images(monkeypatch: pytest.MonkeyPatch, allowed: int, profile: Path) -> None:
+    class Socket(socket.socket):
+        granted = 0
+
+        def setsockopt(self, level: int, name: int, value: int) -> None:  # type: ignore[override]
+            assert (level, name) == (socket.SOL_SOCKET, socket.SO_RCVBUF)
+            # As Linux does: no more than is allowed, and twice that for its own needs.
+            self.granted = 2 * min(value, allowed)
+
+        def getsockopt(self, level: int, name: int) -> int:  # type: ignore[override]
+            return self.granted
+
+    monkeypatch.setattr(socket, "socket", Socket)
+    assert local_profile() == profile
+
+
+def test_the_profiles_ask_for_sockets_that_hold_four_images() -> None:
+    image_bytes = 640 * 480 * 3
+    for profile in (UDP_PROFILE, SHARED_MEMORY_PROFILE, NETWORK_PROFILE):
+        (size,) = re.findall("<receiveBufferSize>([0-9]+)</receiveBufferSize>", profile.read_text())
+        assert int(size) > 4 * image_bytes
+
+
+@pytest.mark.parametrize("base", [UDP_PROFILE, SHARED_MEMORY_PROFILE])
 def test_a_node_started_again_has_ports_of_its_own_unless_the_profile_is_foreign(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, base: Path
 ) -> None:
     monkeypatch.delenv("FASTDDS_DEFAULT_PROFILES_FILE", raising=False)
-    monkeypatch.setenv(_PROFILE, str(LOCAL_PROFILE))
+    monkeypatch.setenv(_PROFILE, str(base))
     monkeypatch.delenv(_RANGE, raising=False)
     offsets: list[int] = []
     for number in range(1, 6):
@@ -38,7 +81,7 @@ def test_a_node_started_again_has_ports_of_its_own_unless_the_profile_is_foreign
         assert variable == _PROFILE
         text = Path(profile).read_text()
         offsets += map(int, re.findall("<offsetd3>([0-9]+)</offsetd3>", text))
-        assert re.sub("<port>.*</port>", "", text) == LOCAL_PROFILE.read_text()
+        assert re.sub("<port>.*</port>", "", text) == base.read_text()
     assert len(set(offsets)) == 5
     # Odd, since even ones are for discovery, and none is the first's.
     assert all(offset % 2 and 11 < offset < 250 for offset in offsets)
@@ -55,7 +98,7 @@ def test_who_asks_for_this_machine_alone_gets_the_profile_which_has_nothing_else
     monkeypatch.setenv(_RANGE, asked)
     assert use_fresh_ports(tmp_path, 1).get(_RANGE, asked) == given
     set_transport_profile()
-    assert (os.environ[_PROFILE], os.environ[_RANGE]) == (str(LOCAL_PROFILE), given)
+    assert (os.environ[_PROFILE], os.environ[_RANGE]) == (str(local_profile()), given)
 
 
 def test_a_foreign_profile_and_the_range_beside_it_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
