@@ -148,4 +148,7 @@ def _joined(parts: list[tuple[FloatArray, IntArray]], voxel_m: float) -> tuple[F
     faces = np.concatenate([faces + first for (_, faces), first in zip(parts, firsts, strict=False)])
     # Blocks compute the same vertex from the same numbers, but for the last bits.
     _, index, inverse = np.unique(np.rint(vertices * 4096).astype(np.int64), axis=0, return_index=True, return_inverse=True)
-    return vertices[index] * voxel_m, inverse.reshape(-1)[faces]
+    faces = inverse.reshape(-1)[faces]
+    first, second, third = faces.T
+    # Slivers thinner than these bits lose a corner.
+    return vertices[index] * voxel_m, faces[(first != second) & (second != third) & (third != first)]

@@ -223,7 +223,10 @@ def _matches(a: FloatArray, b: FloatArray) -> tuple[IntArray, IntArray]:
 
 
 def describe(surface: Surface) -> FloatArray:
-    """Return (N, 39): the FPFH of the points within 5 mm around each (33), their mean colour (3) and its spread (3)."""
+    """Return (N, 39): the FPFH of the points within 5 mm around each (33), their mean colour (3) and its spread (3).
+
+    Points of no known colour, NaN, do not count for the colour; black where there are no others.
+    """
     from scipy.sparse import csr_array
     from scipy.spatial import KDTree
 
@@ -242,9 +245,12 @@ def describe(surface: Surface) -> FloatArray:
     near = 1.0 / (1.0 + np.linalg.norm(surface.points[i] - surface.points[j], axis=1) / _KEYPOINT_M)
     full = histograms + csr_array((near * share[i], (i, j)), shape=(count, count)) @ histograms
     full /= np.maximum(np.linalg.norm(full, axis=1, keepdims=True), 1e-9)
-    average, colours = csr_array((share[i], (i, j)), shape=(count, count)), surface.colours.astype(np.float64) / 255
-    mean = average @ colours
-    spread = np.sqrt(np.maximum(average @ colours**2 - mean**2, 0.0))
+    known = np.isfinite(surface.colours).all(axis=1)
+    colours = np.where(known[:, None], surface.colours, 0.0).astype(np.float64) / 255
+    average = csr_array((share[i], (i, j)), shape=(count, count))
+    of_known = np.maximum(average @ known.astype(np.float64), 1e-9)[:, None]
+    mean = average @ colours / of_known
+    spread = np.sqrt(np.maximum(average @ colours**2 / of_known - mean**2, 0.0))
     return np.concatenate([full, _COLOUR_WEIGHT * mean, _COLOUR_WEIGHT * spread], axis=1)
 
 

@@ -90,6 +90,17 @@ def test_two_maps_that_overlap_become_one_in_the_frame_of_the_first() -> None:
     assert np.isfinite(restore(merged).cloud().points).all()
 
 
+@pytest.mark.parametrize("share", [0.3, 1.0])
+def test_points_that_no_image_coloured_are_merged_by_their_shape(share: float) -> None:
+    left, right = scan(-0.02, 0.012), scan(-0.008, 0.025, MOVED, seed=1)
+    colour = right.columns.colour.copy()
+    colour[np.random.default_rng(2).random(len(colour)) < share] = np.nan
+    merged, (found,) = merge_maps([left, replace(right, columns=replace(right.columns, colour=colour))])
+    assert found.agreeing > 0.9
+    assert np.linalg.norm(transform(found.T_target_source @ MOVED, np.array([[0.0, 0.0, 0.0]]))) < 3e-5
+    assert np.isfinite(merged.columns.colour).any()
+
+
 def test_the_same_maps_give_the_same_result() -> None:
     maps = [scan(-0.03, 0.01), scan(-0.01, 0.03, MOVED, seed=1)]
     one, two = merge_maps(maps)[0], merge_maps(maps)[0]

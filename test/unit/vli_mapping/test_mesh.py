@@ -8,7 +8,7 @@ import pytest
 from vli_common.arrays import FloatArray
 from vli_common.errors import OutputError
 from vli_common.types import PointCloud
-from vli_mapping.mesh import MESH_SUFFIXES, VOXEL_M, ColouredMesh, make_mesh, write_mesh
+from vli_mapping.mesh import MESH_SUFFIXES, VOXEL_M, ColouredMesh, _joined, make_mesh, write_mesh
 
 pytest.importorskip("skimage")
 trimesh = pytest.importorskip("trimesh")
@@ -65,6 +65,13 @@ def test_there_are_no_holes_where_stripes_are_close(mesh: ColouredMesh) -> None:
 def test_blocks_are_sewn_together(mesh: ColouredMesh) -> None:
     item = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     assert item.body_count == 2
+
+
+def test_a_sliver_that_sewing_makes_a_line_is_no_triangle() -> None:
+    corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 1e-5, 0.0]])
+    vertices, faces = _joined([(corners, np.array([[0, 1, 2], [0, 1, 3], [1, 3, 2]]))], 1e-3)
+    assert len(faces) == 1
+    assert set(map(tuple, vertices[faces[0]].tolist())) == {(0.0, 0.0, 0.0), (1e-3, 0.0, 0.0), (0.0, 1e-3, 0.0)}
 
 
 def test_vertices_have_the_colour_of_the_points_around(mesh: ColouredMesh) -> None:
