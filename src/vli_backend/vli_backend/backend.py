@@ -183,6 +183,9 @@ class BackEnd:
             self._last_good_ns = stamp
             self._check_scale(frame, result, estimator)
             self.state, self.reason = TrackingState.TRACKING, self._hint(stamp)
+            if result.problem:
+                self.counters.add("solver_rescues")
+                self.state, self.reason = TrackingState.DEGRADED, f"solver failed, the keyframe is held weakly: {result.problem}"
             if unseen_ns > self._longest_unseen_ns:
                 self.state, self.reason = TrackingState.DEGRADED, f"no image for {unseen_ns / NANOSECONDS:.1f} s: {carrier}"
             return self._output(stamp, result)

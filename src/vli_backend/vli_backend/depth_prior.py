@@ -4,11 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from vli_backend.config import BackEndConfig
+from vli_common.arrays import FloatArray
 from vli_common.calibration import Calibration
+from vli_common.types import LaserScan
 
 _LASER_SPREAD = 0.5
 _VISUAL_SPREAD = 3.0
+_ENOUGH = 5
+"""Landmarks whose median says where others may be."""
 _REACH = 8.0
 """Without any range given, depths may lie this factor around the median that a start from vision finds."""
 
@@ -37,6 +43,12 @@ class DepthPrior:
         near, far = calibration.laser.range_m if calibration.laser is not None else (0.02, 0.15)
         near, far = config.scene.near_m or near, config.scene.far_m or far
         return DepthPrior(near, far, (near * far) ** 0.5)
+
+    def guess(self, scan: LaserScan | None, known: FloatArray) -> float:
+        """Return a new landmark's inverse depth, 1/m: the median of the newest scan, else of landmarks (N,), else the prior's."""
+        if scan is not None and len(scan):
+            return float(1.0 / np.median(scan.points[:, 2]))
+        return float(np.median(known)) if len(known) >= _ENOUGH else 1.0 / self.first
 
     def around(self, median: float) -> DepthPrior:
         """Return the prior of a start from vision, whose landmarks lie at a median depth."""

@@ -39,12 +39,16 @@ from vli_common.types import (
 
 @dataclass(frozen=True)
 class FrameResult:
-    """Live pose of a frame; at a keyframe also the window and the bias; number of landmarks that fit."""
+    """Live pose of a frame; at a keyframe also the window and the bias; number of landmarks that fit.
+
+    ``problem``: why the solver failed at first; the keyframe is then held weakly where it was predicted.
+    """
 
     pose: PoseEstimate | None
     landmarks: int
     window: WindowPoses | None = None
     bias: ImuBias | None = None
+    problem: str = ""
 
 
 class WindowEstimator:
@@ -186,12 +190,12 @@ class WindowEstimator:
         """Solve the window of a start in motion; ``scale_sigma``: how well its scale is known, relative, where no laser tells."""
         if scale_sigma is not None:
             self._smoother.hold_scale(1.0, scale_sigma)
-        self._solve(self._config.start_iterations)
+        covariance, _ = self._solve(self._config.start_iterations)
         self._records = [
             FrameRecord(self._window.stamps[-1], self._state.T_map_imu @ self._T_imu_cam, self._window.stationary[-1])
         ]
         self._predictor.set_keyframe(self._window.stamps[-1], self._state)
-        self._covariance.set_keyframe(self._window.stamps[-1], self._state.T_map_imu, self._smoother.newest_covariance())
+        self._covariance.set_keyframe(self._window.stamps[-1], self._state.T_map_imu, covariance)
 
     def flush(self, session: int) -> WindowPoses | None:
         """Return all frames as final, those after the newest keyframe included."""
@@ -254,18 +258,18 @@ class WindowEstimator:
         moving = not tracks.stationary
         self._moving_keyframes += int(moving)
         first_ones = moving and self._moving_keyframes <= self._config.start_keyframes
-        self._solve(self._config.start_iterations if first_ones else self._config.iterations)
+        covariance, problem = self._solve(self._config.start_iterations if first_ones else self._config.iterations)
         self._candidate = tracks, self._state
         self._predictor.set_keyframe(tracks.stamp_ns, self._state)
         T = self._state.T_map_imu
         self._records = [FrameRecord(tracks.stamp_ns, T @ self._T_imu_cam, tracks.stationary)]
         self._T_map_odom = T @ inverse(T_odom_imu)
         window = self._window.poses(self._keyframe_poses(), int(self._is_full), session)
-        self._covariance.set_keyframe(tracks.stamp_ns, T, self._smoother.newest_covariance(), self._on_map)
+        self._covariance.set_keyframe(tracks.stamp_ns, T, covariance, self._on_map)
         pose = self._estimate(
             tracks.stamp_ns, self._records[0].T_map_camera, self._state.velocity, self._covariance.of_keyframe(), session
         )
-        return FrameResult(pose, found.inliers, window, self._bias(session))
+        return FrameResult(pose, found.inliers, window, self._bias(session), problem)
 
     def _append_keyframe(self, tracks: Tracks, state: KeyframeState, imu: gtsam.PreintegratedCombinedMeasurements | None) -> None:
         elapsed_s = (tracks.stamp_ns - self._window.stamps[-1]) * 1e-9
@@ -289,21 +293,26 @@ class WindowEstimator:
         self._restarted.clear()
 
     def _depth_guess(self) -> float:
-        """Return a new landmark's inverse depth: the median of the newest scan, else of the landmarks, else the prior's."""
-        scan = self._scans[-1] if self._scans else None
-        if scan is None:
-            found = [list(i.scans.values())[-1] for i in self._window.intervals if i.scans]
-            scan = found[-1] if found else None
-        if scan is not None and len(scan):
-            return float(1.0 / np.median(scan.points[:, 2]))
-        known = self._landmarks.arrays.rho[self._landmarks.usable]
-        return float(np.median(known)) if len(known) >= 5 else 1.0 / self._depths.first
+        scan = self._scans[-1] if self._scans else self._window.newest_scan
+        return self._depths.guess(scan, self._landmarks.arrays.rho[self._landmarks.usable])
 
-    def _solve(self, iterations: int) -> None:
-        """Find depths, then poses, velocities and biases of the window."""
+    def _solve(self, iterations: int) -> tuple[FloatArray, str]:
+        """Find depths, then poses, velocities and biases of the window.
+
+        Returns:
+            Covariance (6, 6) of the newest pose; why the solver failed at first, if it did: what it knew is kept.
+        """
         self._measure_depths()
         self._map = self.constraints
-        self._smoother.solve(self._condenser(self._landmarks.usable, range(len(self._window.intervals))), iterations)
+        condenser, problem = self._condenser(self._landmarks.usable, range(len(self._window.intervals))), ""
+        try:
+            self._smoother.solve(condenser, iterations)
+            covariance = self._smoother.newest_covariance()
+        except SmootherError as error:
+            problem = str(error)
+            self._smoother.hold_newest()
+            self._smoother.solve(condenser, iterations)
+            covariance = self._smoother.newest_covariance()
         self._state = self._smoother.states()[-1]
         jump = self._jump(self._records[-1].T_map_camera, self._state.T_map_imu @ self._T_imu_cam)
         if jump > self._largest_jump:
@@ -311,6 +320,7 @@ class WindowEstimator:
         poses = self._keyframe_poses()
         self._refine(poses, np.ones(len(self._landmarks), np.bool_))
         self._points = self._landmarks.points(poses)
+        return covariance, problem
 
     def _condenser(self, use: BoolArray, map_intervals: range) -> Condenser:
         """Return what linearises the used landmarks, and the map constraints of the stripes in some of the intervals."""

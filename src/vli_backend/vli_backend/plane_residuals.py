@@ -19,15 +19,41 @@ class PlaneResiduals:
 
     Args:
         rays: (N, 2) where the laser measured them.
-        inverse_depth: (N,) 1/m, by the laser.
-        error: (N,) 1/m, laser less vision.
-        sigma: (N,) 1/m, of the error.
+        laser, laser_sigma: (N,) inverse depth and its sigma by the laser, 1/m.
+        vision, vision_sigma: (N,) the same by the other observations.
     """
 
     rays: FloatArray
-    inverse_depth: FloatArray
-    error: FloatArray
-    sigma: FloatArray
+    laser: FloatArray
+    laser_sigma: FloatArray
+    vision: FloatArray
+    vision_sigma: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.laser)
+
+    @property
+    def error(self) -> FloatArray:
+        """Of the laser's depth against vision's (N,), relative: positive where the laser says farther."""
+        result: FloatArray = (self.vision - self.laser) / self.fused
+        return result
+
+    @property
+    def sigma(self) -> FloatArray:
+        """Of :attr:`error` (N,)."""
+        result: FloatArray = np.hypot(self.laser_sigma, self.vision_sigma) / self.fused
+        return result
+
+    @property
+    def fused(self) -> FloatArray:
+        """The inverse depth (N,) that both give together, 1/m.
+
+        Its error is not correlated with that of the difference, which the error of either alone is: against such a depth noise
+        would look like an error that changes with range.
+        """
+        weight, other = self.laser_sigma**-2, self.vision_sigma**-2
+        result: FloatArray = (weight * self.laser + other * self.vision) / (weight + other)
+        return result
 
 
 def plane_residuals(
@@ -62,5 +88,4 @@ def plane_residuals(
     anchor, primary = T_map_camera[blind.anchor], T_map_camera[slot]
     in_map = np.einsum("nij,nj->ni", anchor[:, :3, :3], rays) + anchor[:, :3, 3]
     seen = np.einsum("nji,nj->ni", primary[:, :3, :3], in_map - primary[:, :3, 3])
-    error = measured - 1.0 / seen[:, 2]
-    return PlaneResiduals(seen[:, :2] / seen[:, 2:], measured, error, np.hypot(sigma, information**-0.5))
+    return PlaneResiduals(seen[:, :2] / seen[:, 2:], measured, sigma, 1.0 / seen[:, 2], information**-0.5)

@@ -28,6 +28,9 @@ _UNMEASURED_VELOCITY = 0.1
 """Sigma of the velocity at a keyframe without IMU, m/s: a hand in a confined space is slower."""
 
 
+_WEAK = (0.1, 0.01, 0.1, 0.1, 0.01)
+"""Sigmas of a keyframe that the solver fails on: rad, m, m/s, m/s² and rad/s of the biases. Any measurement says more."""
+
 _STILL = (1e-4, 3e-6)
 """rad, m: how still a scanner at rest stands from keyframe to keyframe. Features alone leave ten times that, which adds up."""
 
@@ -83,6 +86,9 @@ class Smoother(Protocol):
 
     def hold_scale(self, ratio: float, relative_sigma: float) -> None:
         """Tie the largest distance between two keyframes of the window to ``ratio`` times its present value; relative sigma."""
+
+    def hold_newest(self) -> None:
+        """Tie the newest keyframe weakly to where it is: what nothing determines no longer makes the solver fail."""
 
     def solve(self, condenser: Condenser, iterations: int) -> int:
         """Iterate to convergence; return the iterations used."""
@@ -170,6 +176,18 @@ class GtsamSmoother:
         noise = gtsam.noiseModel.Isotropic.Sigma(1, relative_sigma * distance)
         self._new_factors.add(gtsam.RangeFactorPose3(X(self._first + i), X(self._first + j), distance, noise))
 
+    def hold_newest(self) -> None:
+        """See :meth:`Smoother.hold_newest`."""
+        newest = self._first + self._count - 1
+        rotation, position, velocity, accel_bias, gyro_bias = _WEAK
+        values, noise = self._estimate, gtsam.noiseModel
+        pose_noise = noise.Diagonal.Sigmas(np.repeat([rotation, position], 3))
+        self._new_factors.add(gtsam.PriorFactorPose3(X(newest), values.atPose3(X(newest)), pose_noise))
+        velocity_noise = noise.Isotropic.Sigma(3, velocity)
+        self._new_factors.add(gtsam.PriorFactorVector(V(newest), values.atVector(V(newest)), velocity_noise))
+        bias_noise = noise.Diagonal.Sigmas(np.repeat([accel_bias, gyro_bias], 3))
+        self._new_factors.add(gtsam.PriorFactorConstantBias(B(newest), values.atConstantBias(B(newest)), bias_noise))
+
     def solve(self, condenser: Condenser, iterations: int) -> int:
         """See :meth:`Smoother.solve`."""
         poses = self._poses()
@@ -241,9 +259,11 @@ class GtsamSmoother:
     def _replace(self, container: gtsam.LinearContainerFactor) -> None:
         self._new_factors.add(container)
         removed = [self._slot_of(self._container)] if self._container is not None else []
-        self._update(self._new_factors, self._new_values, self._new_stamps, removed)
+        added = self._new_factors, self._new_values, self._new_stamps
+        # GTSAM takes them before it solves: after a failure they are in, and must not be added again.
         self._container = container
         self._new_factors, self._new_values, self._new_stamps = gtsam.NonlinearFactorGraph(), gtsam.Values(), {}
+        self._update(*added, removed)
 
     def _slot_of(self, factor: gtsam.NonlinearFactor) -> int:
         factors = self._smoother.getFactors()

@@ -97,6 +97,11 @@ class Window:
     def __len__(self) -> int:
         return len(self.stamps)
 
+    @property
+    def newest_scan(self) -> LaserScan | None:
+        """The last stripe of the newest interval that has any."""
+        return next((list(interval.scans.values())[-1] for interval in reversed(self.intervals) if interval.scans), None)
+
     def append(self, stamp_ns: int, stationary: bool, interval: Interval | None) -> None:
         """Add a keyframe and the interval before it (None for the first)."""
         if interval is not None:
