@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import os
+import random
+from collections.abc import Iterator
 from pathlib import Path
 
 import hypothesis
 import pytest
+
+from vli_bringup.settings import Settings, to_yaml
 
 # The first example of a test may compile or load a kernel.
 hypothesis.settings.register_profile("vli", deadline=None)
@@ -27,4 +31,20 @@ def shared_data() -> Path:
     path = Path(os.environ.get("VLI_SHARED", REPOSITORY.parent / "shared")) / "data"
     if not path.is_dir():
         pytest.skip(f"needs the recordings in '{path}'; set VLI_SHARED to the directory that holds 'data'")
+    return path
+
+
+@pytest.fixture(scope="module")
+def own_domain() -> Iterator[None]:
+    """Keep the nodes of a module apart from whatever else speaks ROS on this machine."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROS_DOMAIN_ID", str(random.randint(100, 200)))
+        yield
+
+
+@pytest.fixture
+def parameter_file(tmp_path: Path) -> Path:
+    """Return a file with every parameter at its default, for nodes."""
+    path = tmp_path / "vli.yaml"
+    path.write_text(to_yaml(Settings()))
     return path

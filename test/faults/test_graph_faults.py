@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import random
 import re
 import signal
 import subprocess
@@ -22,7 +21,6 @@ from vli_bringup.graph import NodeDescription
 from vli_bringup.listener import LISTENER, GraphListener
 from vli_bringup.processes import NodeProcesses
 from vli_bringup.recorder import Recorder
-from vli_bringup.settings import Settings, to_yaml
 from vli_bringup.watch import GraphWatch
 from vli_common.calibration import load_calibration
 from vli_common.messages import cloud_from_message
@@ -30,26 +28,10 @@ from vli_common.node.transport import message_type, quality
 from vli_common.topics import MAP
 from vli_mapping.map_file import load_map
 
-pytestmark = pytest.mark.graph
+pytestmark = [pytest.mark.graph, pytest.mark.usefixtures("own_domain")]
 
 _MAPPING, _BACK_END = "mapping_node", "backend_node"
 _LOOP = {"driver_node": {"loop": True}}
-
-
-@pytest.fixture(scope="module", autouse=True)
-def own_domain() -> Iterator[None]:
-    """Keep apart from whatever else speaks ROS on this machine."""
-    patch = pytest.MonkeyPatch()
-    patch.setenv("ROS_DOMAIN_ID", str(random.randint(100, 200)))
-    yield
-    patch.undo()
-
-
-@pytest.fixture
-def parameter_file(tmp_path: Path) -> Path:
-    path = tmp_path / "vli.yaml"
-    path.write_text(to_yaml(Settings()))
-    return path
 
 
 @pytest.fixture

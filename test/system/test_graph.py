@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import random
 import signal
 import subprocess
 import sys
@@ -26,33 +25,16 @@ from vli_bringup.graph import NodeDescription, Playback, describe_graph
 from vli_bringup.listener import GraphListener
 from vli_bringup.processes import MAX_RESTARTS, GraphError, NodeProcesses
 from vli_bringup.recorder import Recorder
-from vli_bringup.settings import Settings, to_yaml
 from vli_common.calibration import load_calibration
 from vli_common.geometry import align
 from vli_common.status import NodeState
 
-pytestmark = pytest.mark.graph
-
-
-@pytest.fixture(scope="module", autouse=True)
-def own_domain() -> Iterator[None]:
-    """Keep apart from whatever else speaks ROS on this machine."""
-    patch = pytest.MonkeyPatch()
-    patch.setenv("ROS_DOMAIN_ID", str(random.randint(100, 200)))
-    yield
-    patch.undo()
+pytestmark = [pytest.mark.graph, pytest.mark.usefixtures("own_domain")]
 
 
 @pytest.fixture
 def calibration(tmp_path: Path) -> Path:
     return write_calibration(tmp_path / "calibration.yaml")
-
-
-@pytest.fixture
-def parameter_file(tmp_path: Path) -> Path:
-    path = tmp_path / "vli.yaml"
-    path.write_text(to_yaml(Settings()))
-    return path
 
 
 @pytest.fixture

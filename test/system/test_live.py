@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import random
 import signal
 import subprocess
 import sys
@@ -32,10 +31,8 @@ _START_S = 240.0
 
 
 @pytest.fixture
-def scanner() -> Iterator[Node]:
+def scanner(own_domain: None) -> Iterator[Node]:
     """Return a node of a process of its own, as far as the middleware can tell."""
-    patch = pytest.MonkeyPatch()
-    patch.setenv("ROS_DOMAIN_ID", str(random.randint(100, 200)))
     set_transport_profile()
     context = Context()
     rclpy.init(context=context)
@@ -43,7 +40,6 @@ def scanner() -> Iterator[Node]:
     yield node
     node.destroy_node()
     rclpy.shutdown(context=context)
-    patch.undo()
 
 
 def publish(node: Node, messages: list[RawMessage], rate: float) -> None:

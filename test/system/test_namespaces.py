@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 import subprocess
 from pathlib import Path
 
@@ -18,13 +17,10 @@ from vli_common.calibration import load_calibration
 _UNKNOWN = "_NODE_NAMESPACE_UNKNOWN_"
 """What ROS says of an end whose node it has not heard of yet."""
 
-pytestmark = pytest.mark.graph
+pytestmark = [pytest.mark.graph, pytest.mark.usefixtures("own_domain")]
 
 
-def test_scanners_in_namespaces_of_their_own_share_nothing_but_diagnostics(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(random.randint(100, 200)))
+def test_scanners_in_namespaces_of_their_own_share_nothing_but_diagnostics(tmp_path: Path) -> None:
     calibration = write_calibration(tmp_path / "calibration.yaml")
     with GraphListener(Recorder(load_calibration(calibration))) as listener:
         node = listener.node

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import random
 import signal
 import subprocess
 import sys
@@ -32,17 +31,14 @@ _START_S = 120.0
 
 
 @pytest.fixture(scope="module")
-def node() -> Iterator[Node]:
+def node(own_domain: None) -> Iterator[Node]:
     """Return a node in a domain apart from whatever else speaks ROS on this machine."""
-    patch = pytest.MonkeyPatch()
-    patch.setenv("ROS_DOMAIN_ID", str(random.randint(100, 200)))
     set_transport_profile()
     rclpy.init(signal_handler_options=rclpy.SignalHandlerOptions.NO)
     node = rclpy.create_node("camera")
     yield node
     node.destroy_node()
     rclpy.try_shutdown()
-    patch.undo()
 
 
 @contextmanager

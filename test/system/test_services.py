@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import random
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -13,29 +11,18 @@ from graph_tools import NODES, demo_graph, text, wait
 from vli_bringup.listener import GraphListener
 from vli_bringup.processes import NodeProcesses
 from vli_bringup.recorder import Recorder
-from vli_bringup.settings import Settings, to_yaml
 from vli_common.calibration import load_calibration
 from vli_common.status import NodeState
 from vli_mapping.map_file import load_map
 
-pytestmark = pytest.mark.graph
+pytestmark = [pytest.mark.graph, pytest.mark.usefixtures("own_domain")]
 
 _MAPPING, _BACK_END, _DRIVER = "mapping_node", "backend_node", "driver_node"
 _ANSWER_S = 60.0
 
 
-@pytest.fixture(scope="module", autouse=True)
-def own_domain() -> Iterator[None]:
-    """Keep apart from whatever else speaks ROS on this machine."""
-    patch = pytest.MonkeyPatch()
-    patch.setenv("ROS_DOMAIN_ID", str(random.randint(100, 200)))
-    yield
-    patch.undo()
-
-
-def test_services_of_a_running_scan(repository: Path, tmp_path: Path) -> None:
-    demo, parameter_file = repository / "bags" / "demo", tmp_path / "vli.yaml"
-    parameter_file.write_text(to_yaml(Settings()))
+def test_services_of_a_running_scan(repository: Path, tmp_path: Path, parameter_file: Path) -> None:
+    demo = repository / "bags" / "demo"
     saved, mesh, autosaved = tmp_path / "map.vli", tmp_path / "mesh.ply", tmp_path / "autosave.vli"
     store = {
         "save_path": str(saved),

@@ -16,7 +16,6 @@ from typing import Any
 import pytest
 from graph_tools import START_S
 
-from vli_bringup.settings import Settings, to_yaml
 from vli_common.node.transport import NETWORK_PROFILE
 
 pytestmark = [pytest.mark.graph, pytest.mark.slow]
@@ -105,10 +104,9 @@ class Host:
 
 
 def test_a_cable_pulled_for_three_seconds_interrupts_the_graph_and_no_more(
-    hosts: Hosts, repository: Path, tmp_path: Path
+    hosts: Hosts, repository: Path, parameter_file: Path
 ) -> None:
-    demo, parameter_file = repository / "bags" / "demo", tmp_path / "vli.yaml"
-    parameter_file.write_text(to_yaml(Settings()))
+    demo = repository / "bags" / "demo"
     driver, rest = (Host(name, role, demo, parameter_file) for name, role in zip(hosts.names, ("driver", "rest"), strict=True))
     try:
         rest.wait(lambda said: said["tracking"] == "TRACKING" and said["poses"] > 0)

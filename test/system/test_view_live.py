@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import random
 import signal
 import socket
 import subprocess
@@ -46,10 +45,8 @@ class Heard:
 
 
 @pytest.fixture
-def graph() -> Iterator[Node]:
+def graph(own_domain: None) -> Iterator[Node]:
     """Return a node of a process of its own, as far as the middleware can tell."""
-    patch = pytest.MonkeyPatch()
-    patch.setenv("ROS_DOMAIN_ID", str(random.randint(100, 200)))
     set_transport_profile()
     context = Context()
     rclpy.init(context=context)
@@ -57,7 +54,6 @@ def graph() -> Iterator[Node]:
     yield node
     node.destroy_node()
     rclpy.shutdown(context=context)
-    patch.undo()
 
 
 def cloud(count: int) -> PointCloud:

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from typing import Any, Protocol
 
-from rclpy.executors import SingleThreadedExecutor
+from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.subscription import Subscription
 from rclpy.task import Future
@@ -46,7 +46,24 @@ class Spinner(Protocol):
         ...
 
 
-class EventSpinner:
+class _ExecutorSpinner:
+    """An executor of rclpy with one node.
+
+    Args:
+        executor: that runs the callbacks.
+        node: whose callbacks are run.
+    """
+
+    def __init__(self, executor: Executor, node: Node) -> None:
+        self._executor = executor
+        self._executor.add_node(node)
+
+    def close(self) -> None:
+        """Let go of the node."""
+        self._executor.shutdown(timeout_sec=0)
+
+
+class EventSpinner(_ExecutorSpinner):
     """Sleeps until the middleware has something.
 
     Args:
@@ -54,17 +71,12 @@ class EventSpinner:
     """
 
     def __init__(self, node: Node) -> None:
-        self._executor = EventsExecutor()
-        self._executor.add_node(node)
+        super().__init__(EventsExecutor(), node)
 
     def spin(self, seconds: float) -> None:
         """Run callbacks for so long."""
         # Its spin() would never come back to let Python handle a signal; its spin_once() would do so for every message.
         self._executor.spin_until_future_complete(Future(), seconds)
-
-    def close(self) -> None:
-        """Let go of the node."""
-        self._executor.shutdown(timeout_sec=0)
 
     @staticmethod
     def receiver(accept: Callable[[Any], None], subscription: Callable[[], Subscription | None]) -> Callable[[Any], None]:
@@ -72,7 +84,7 @@ class EventSpinner:
         return accept
 
 
-class WaitSetSpinner:
+class WaitSetSpinner(_ExecutorSpinner):
     """Waits for a set of all entities of the node.
 
     Args:
@@ -80,17 +92,12 @@ class WaitSetSpinner:
     """
 
     def __init__(self, node: Node) -> None:
-        self._executor = SingleThreadedExecutor()
-        self._executor.add_node(node)
+        super().__init__(SingleThreadedExecutor(), node)
 
     def spin(self, seconds: float) -> None:
         """Run one callback, then let others gather."""
         self._executor.spin_once(timeout_sec=seconds)
         time.sleep(_REST_S)
-
-    def close(self) -> None:
-        """Let go of the node."""
-        self._executor.shutdown(timeout_sec=0)
 
     @staticmethod
     def receiver(accept: Callable[[Any], None], subscription: Callable[[], Subscription | None]) -> Callable[[Any], None]:
