@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from vli_mapping.spatial_hash import bucket_of, cell_of, link_one, unlink_one
+from vli_mapping.spatial_hash import bucket_of, cell_of, link_one, same_cell, unlink_one
 
 ROWS, FREE_HEAD, FREE = 0, 1, 2
 """Of the state (3,): rows in use, first of the chain of free rows among them (−1: none), and how many these are."""
@@ -178,14 +178,12 @@ def _merge(heads, following, cell_m, at, columns, views, stripe, index, number, 
     p, n, c, sigma_new = stripe[0][index], stripe[1][index], stripe[2][index], stripe[3][index]
     old_information, new_information = 1.0 / np.float64(sigma[at]) ** 2, 1.0 / np.float64(sigma_new) ** 2
     gain = new_information / (old_information + new_information)
-    moved = np.empty(3)
-    same = True
-    for axis in range(3):
-        moved[axis] = position[at, axis] + gain * (p[axis] - position[at, axis])
-        same = same and cell_of(moved[axis], cell_m) == cell_of(position[at, axis], cell_m)
+    old = position[at]
+    moved = (old[0] + gain * (p[0] - old[0]), old[1] + gain * (p[1] - old[1]), old[2] + gain * (p[2] - old[2]))
+    same = same_cell(moved, cell_of(old[0], cell_m), cell_of(old[1], cell_m), cell_of(old[2], cell_m), cell_m)
     if not same:
-        unlink_one(heads, following, at, position[at], cell_m)
-    position[at] = moved
+        unlink_one(heads, following, at, old, cell_m)
+    old[0], old[1], old[2] = moved
     if not same:
         link_one(heads, following, at, moved, cell_m)
     share = 1.0 / (weight[at] + 1.0)

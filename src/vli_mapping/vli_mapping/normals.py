@@ -118,23 +118,24 @@ def fit_plane(positions, which, origin, plane):  # type: ignore[no-untyped-def]
     if count < 3:
         plane[:3] = origin
         return
-    mean = np.zeros(3)
+    mean_x = mean_y = mean_z = 0.0
     for index in which:
-        for axis in range(3):
-            mean[axis] += positions[index, axis] - origin[axis]
-    mean /= count
+        mean_x += positions[index, 0] - origin[0]
+        mean_y += positions[index, 1] - origin[1]
+        mean_z += positions[index, 2] - origin[2]
+    mean_x, mean_y, mean_z = mean_x / count, mean_y / count, mean_z / count
     xx = xy = xz = yy = yz = zz = 0.0
     for index in which:
-        x = positions[index, 0] - origin[0] - mean[0]
-        y = positions[index, 1] - origin[1] - mean[1]
-        z = positions[index, 2] - origin[2] - mean[2]
+        x = positions[index, 0] - origin[0] - mean_x
+        y = positions[index, 1] - origin[1] - mean_y
+        z = positions[index, 2] - origin[2] - mean_z
         xx += x * x
         xy += x * y
         xz += x * z
         yy += y * y
         yz += y * z
         zz += z * z
-    plane[:3] = origin + mean
+    plane[0], plane[1], plane[2] = origin[0] + mean_x, origin[1] + mean_y, origin[2] + mean_z
     smallest, middle, largest = smallest_eigenvector(
         xx / count, xy / count, xz / count, yy / count, yz / count, zz / count, plane[3:6]
     )
@@ -173,7 +174,8 @@ def smallest_eigenvector(xx, xy, xz, yy, yz, zz, vector):  # type: ignore[no-unt
             best = norm
             vector[0], vector[1], vector[2] = x, y, z
     if best > 1e-20:
-        vector /= np.sqrt(best)
+        length = np.sqrt(best)
+        vector[0], vector[1], vector[2] = vector[0] / length, vector[1] / length, vector[2] / length
     else:
         vector[:] = 0.0
     return max(mean + spread * lowest, 0.0), max(mean - spread * (largest + lowest), 0.0), mean + spread * largest

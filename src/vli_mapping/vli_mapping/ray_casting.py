@@ -14,7 +14,8 @@ def direct(start, end, ray):  # type: ignore[no-untyped-def]
     for axis in range(3):
         ray[axis] = end[axis] - start[axis]
     length = np.sqrt(ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2)
-    ray /= length
+    for axis in range(3):
+        ray[axis] /= length
     return length
 
 
