@@ -245,10 +245,10 @@ def describe(surface: Surface) -> FloatArray:
     near = 1.0 / (1.0 + np.linalg.norm(surface.points[i] - surface.points[j], axis=1) / _KEYPOINT_M)
     full = histograms + csr_array((near * share[i], (i, j)), shape=(count, count)) @ histograms
     full /= np.maximum(np.linalg.norm(full, axis=1, keepdims=True), 1e-9)
-    known = np.isfinite(surface.colours).all(axis=1)
+    known = np.isfinite(surface.colours[:, 0])
     colours = np.where(known[:, None], surface.colours, 0.0).astype(np.float64) / 255
     average = csr_array((share[i], (i, j)), shape=(count, count))
-    of_known = np.maximum(average @ known.astype(np.float64), 1e-9)[:, None]
+    of_known = np.maximum(np.bincount(i, share[i] * known[j], count), 1e-9)[:, None]
     mean = average @ colours / of_known
     spread = np.sqrt(np.maximum(average @ colours**2 / of_known - mean**2, 0.0))
     return np.concatenate([full, _COLOUR_WEIGHT * mean, _COLOUR_WEIGHT * spread], axis=1)
