@@ -7,17 +7,16 @@ again has memory of its own, so that is what helps: the graph heals as after a c
 from __future__ import annotations
 
 import time
+from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Protocol
 
 from vli_bringup.listener import count_of
+from vli_common.reception import Reception
 from vli_common.status import NodeState, StageStatus
 
 _SILENT_S = 20.0
 """Nodes say once a second how they are."""
-_DEAF_S, _DEAF_MESSAGES = 6.0, 30
-"""So many messages of another node that have not come, in so long, are not under way."""
 _AT_WORK = (NodeState.READY, NodeState.FINISHED)
 
 
@@ -26,16 +25,6 @@ class Ender(Protocol):
 
     def end(self, node: str, reason: str) -> None:
         """End a node that is not as it should be; who looks after crashes starts it again."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Mark:
-    """What a reader had received, and its source sent, at a time (monotonic seconds), and the session."""
-
-    session: str
-    received: int
-    sent: int
-    at_s: float
 
 
 class GraphWatch:
@@ -49,7 +38,7 @@ class GraphWatch:
 
     def __init__(self, processes: Ender) -> None:
         self._processes = processes
-        self._marks: dict[tuple[str, str], _Mark] = {}
+        self._receptions: dict[tuple[str, str], Reception] = defaultdict(Reception)
         self._blamed: set[tuple[str, str]] = set()
         self._patient_until_s: dict[str, float] = {}
 
@@ -81,20 +70,20 @@ class GraphWatch:
     ) -> None:
         session = statuses[node].values.get("session", "")
         sent = count_of(statuses[source].values[f"sent.{topic}"])
-        mark = self._marks.get((node, topic))
-        if mark is None or (mark.session, mark.received) != (session, received) or sent < mark.sent:
-            self._marks[node, topic] = _Mark(session, received, sent, now_s)
-            if mark is not None and received > mark.received:
-                self._blamed.discard((node, topic))
-            return
-        if session != statuses[source].values.get("session") or now_s - mark.at_s < _DEAF_S or sent - mark.sent < _DEAF_MESSAGES:
+        reception = self._receptions[node, topic]
+        before = reception.received
+        missed = reception.missed(session, received, sent, now_s)
+        if before is not None and received > before:
+            self._blamed.discard((node, topic))
+        if not missed or session != statuses[source].values.get("session"):
             return
         guilty = source if (node, topic) in self._blamed else node
         self._blamed ^= {(node, topic)}
-        del self._marks[node, topic]
-        self._end(guilty, f"is cut off: '{node}' has heard nothing of {sent - mark.sent} messages on '{topic}'", now_s)
+        del self._receptions[node, topic]
+        self._end(guilty, f"is cut off: '{node}' has heard nothing of {missed} messages on '{topic}'", now_s)
 
     def _end(self, node: str, reason: str, now_s: float) -> None:
         self._patient_until_s[node] = now_s
-        self._marks = {key: mark for key, mark in self._marks.items() if key[0] != node}
+        for key in [key for key in self._receptions if key[0] == node]:
+            del self._receptions[key]
         self._processes.end(node, reason)

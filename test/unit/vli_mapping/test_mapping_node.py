@@ -1,4 +1,4 @@
-"""The mapping node under overload: what waits for its worker."""
+"""The mapping node under overload, and cut off: what waits for its worker, and what does not come."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 import rclpy
 
-from vli_common.messages import image_to_cdr, scan_to_message
-from vli_common.topics import IMAGE_LONG, LASER_POINTS
+from vli_common.messages import image_to_cdr, scan_to_message, status_to_message
+from vli_common.node import inputs
+from vli_common.status import Health, NodeState, StageStatus
+from vli_common.topics import IMAGE_LONG, LASER_POINTS, STATUS
 from vli_common.types import Image, LaserScan
 from vli_mapping.nodes.mapping_node import MappingNode
 
@@ -55,3 +57,23 @@ def test_what_waits_is_bounded_and_what_goes_is_counted(node):
     values = dropped(node)
     assert int(values["waiting.laser_points"]) + int(values["dropped.laser_points"]) == 500
     assert int(values["waiting.laser_points"]) == 12 * LASER_POINTS.depth
+
+
+def test_a_node_that_hears_nothing_of_what_another_sends_says_so_until_it_does(node, monkeypatch):
+    now_s = 1000.0
+    monkeypatch.setattr(inputs.time, "monotonic", lambda: now_s)
+    node.set_state(NodeState.READY)
+    say, said = callback(node, STATUS.name), []
+    for second in range(10):
+        now_s += 1.0
+        values = {"session": "0", f"sent.{LASER_POINTS.name}": str(30 * second)}
+        say(status_to_message(StageStatus(second, "demux_node", Health.OK, NodeState.READY, "", values)))
+        if second == 8:
+            callback(node, LASER_POINTS.name)(scan_to_message(LaserScan.empty(second)))
+        node.publish_status()
+        said.append(node.others["mapping_node"])
+    assert [status.health for status in said] == [Health.OK] * 6 + [Health.WARN] * 3 + [Health.OK]
+    assert said[7].hint == (
+        "cut off: nothing has come of 210 messages of 'demux_node' on 'laser_points'; start this node again, else that one"
+    )
+    assert "cut off" not in said[-1].hint

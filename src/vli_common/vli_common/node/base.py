@@ -348,8 +348,15 @@ class VliNode(WorkingNode):
             self.enqueue(partial(self.on_restart, status.node))
         if _number(status, "session") > self._newest_session:
             self._begin(Session(_number(status, "session"), f"heard of from {status.node}"))
+        if status.values.get("session") == str(self._newest_session):
+            self._note_sent(status)
         if status.state is NodeState.FINISHED and status.values.get("session") == str(self.session):
             self._finished_sources[status.node] = status.values
+
+    def _note_sent(self, status: StageStatus) -> None:
+        for name, entry in self._inputs.items():
+            if f"sent.{name}" in status.values and status.node != self.get_name():
+                entry.note_sent(status.node, _number(status, f"sent.{name}"), self._newest_session)
 
     def _check_finish(self) -> None:
         """Finish once every source has, and all that it sent has come and is worked off."""
@@ -387,8 +394,10 @@ class VliNode(WorkingNode):
     def _status(self) -> StageStatus:
         health, hint, values = self.stage_status()
         dropped = self._worker.dropped.values
-        if dropped:
+        cut_off = next((entry.cut_off for entry in self._inputs.values() if entry.cut_off), "")
+        if dropped or cut_off:
             health = Health.WARN if health is Health.OK else health
+        if dropped:
             hint = hint or f"too slow: {', '.join(f'{count} of {name}' for name, count in dropped.items())} dropped"
         if self.state is NodeState.FAILED:
             health = Health.ERROR
@@ -397,7 +406,7 @@ class VliNode(WorkingNode):
             node=self.get_name(),
             health=health,
             state=self.state,
-            hint=self._hint or self._calibration_hint or hint,
+            hint=self._hint or self._calibration_hint or cut_off or hint,
             values={
                 "session": str(self.session),
                 "started_ns": str(self.started_ns),

@@ -14,6 +14,7 @@ from rclpy.subscription import Subscription
 
 from vli_common import cdr
 from vli_common.node.transport import message_type, quality
+from vli_common.reception import Reception
 from vli_common.status import RateMeter
 from vli_common.topics import Topic
 
@@ -42,6 +43,9 @@ class Input:
     rate: RateMeter = field(default_factory=RateMeter)
     received: int = 0
     last_s: float = field(default_factory=time.monotonic)
+    cut_off: str = ""
+    """That nothing comes of what another node sends, in words; empty where something does."""
+    _reception: Reception = field(default_factory=Reception)
     _is_mismatched: bool = False
     _left_to_shed: int = 0
 
@@ -91,6 +95,15 @@ class Input:
         self.rate.add()
         self.received += 1
         self.last_s = time.monotonic()
+
+    def note_sent(self, node: str, sent: int, session: int) -> None:
+        """Compare with what another node of the same session says it has sent."""
+        missed = self._reception.missed(str(session), self.received, sent, time.monotonic())
+        self.cut_off = (
+            f"cut off: nothing has come of {missed} messages of '{node}' on '{self.name}'; start this node again, else that one"
+            if missed
+            else ""
+        )
 
     def is_shed(self, is_behind: bool) -> bool:
         """Return True where the next message is to be dropped."""
