@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,13 +22,16 @@ from sensor_msgs.msg import Imu
 from tiny_bag import TinyBag, write_calibration
 
 from vli_bringup.cli import main
-from vli_bringup.graph import NodeDescription, Playback, describe_graph
-from vli_bringup.listener import GraphListener
+from vli_bringup.graph import SCANNER, NodeDescription, Playback, describe_graph
+from vli_bringup.listener import LISTENER, GraphListener
 from vli_bringup.processes import MAX_RESTARTS, GraphError, NodeProcesses
 from vli_bringup.recorder import Recorder
 from vli_common.calibration import load_calibration
 from vli_common.geometry import align
+from vli_common.messages import status_from_message
+from vli_common.node.transport import message_type, quality
 from vli_common.status import NodeState
+from vli_common.topics import STATUS
 
 pytestmark = [pytest.mark.graph, pytest.mark.usefixtures("own_domain")]
 
@@ -158,6 +162,29 @@ def test_a_reset_begins_a_new_session_in_every_node(
             listener.call("mapping_node/save", 10.0)
         pids = processes.pids
     assert not any(Path(f"/proc/{pid}").exists() for pid in pids.values())
+
+
+def test_a_bag_that_is_played_again_and_again_loses_nothing_between_its_end_and_its_beginning(
+    tmp_path: Path, calibration: Path, parameter_file: Path, listener: GraphListener
+) -> None:
+    nodes = describe_graph(calibration, playback=Playback(TinyBag().write(tmp_path / "bag")), audience=LISTENER)
+    looped = [
+        replace(node, parameters={**node.parameters, "loop": True}) if node.executable == SCANNER else node for node in nodes
+    ]
+    finished: set[tuple[str, str]] = set()
+
+    def note(message: object) -> None:
+        status = status_from_message(message)
+        if status.state is NodeState.FINISHED:
+            finished.add((status.node, status.values["session"]))
+
+    listener.node.create_subscription(message_type(STATUS), STATUS.name, note, quality(STATUS, reading=True))
+    with NodeProcesses(looped, parameter_file) as processes:
+        wait(listener, lambda: listener.value("mapping_node", "session") == 3, processes=processes)
+    assert finished == {(name, session) for name in NODES for session in "12"}
+    assert "node.dropped_by_session" not in {
+        key for status in listener.statuses.values() for key, value in status.values.items() if value != "0"
+    }
 
 
 def is_running(pid: int | str) -> bool:

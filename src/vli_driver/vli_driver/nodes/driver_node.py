@@ -22,6 +22,8 @@ from vli_driver.player import BagPlayer, PlaybackConfig
 _POLL_S = 0.02
 _SETTLE_S = 0.3
 """A writer may know its reader a moment later than the reader knows its writer."""
+_DRAIN_S = 5.0
+"""Between loops the other nodes get so long to work off what they hold."""
 
 
 class DriverNode(VliNode):
@@ -117,8 +119,23 @@ class DriverNode(VliNode):
                 return
             for warning in reader.warnings:
                 self.get_logger().warning(warning)
+            self.set_state(NodeState.FINISHED)
             again = self._playback.loop
-        self.set_state(NodeState.FINISHED)
+            if again:
+                self._wait_until_finished()
+
+    def _wait_until_finished(self) -> None:
+        """Return when the awaited nodes have finished: a new session drops what they hold back for images that follow."""
+        deadline_s = time.monotonic() + _DRAIN_S
+        while time.monotonic() < deadline_s:
+            awaited = [self.others[name] for name in self._awaited() if name in self.others]
+            # Who only listens counts nothing as handled, and never finishes.
+            if all(status.state is NodeState.FINISHED for status in awaited if "handled" in status.values):
+                return
+            time.sleep(_POLL_S)
+
+    def _awaited(self) -> list[str]:
+        return [name.strip() for name in self._playback.wait_for.split(",") if name.strip()]
 
     def _on_jump(self, reason: str, stamp_ns: int) -> None:
         self._begin_session(reason, stamp_ns)
@@ -134,7 +151,7 @@ class DriverNode(VliNode):
 
     def _wait_for_all(self, session: int, deadline_s: float) -> None:
         """Return when the awaited nodes are of the session, the session is no more the newest, or it takes too long."""
-        names = [self.get_name(), *(name.strip() for name in self._playback.wait_for.split(",") if name.strip())]
+        names = [self.get_name(), *self._awaited()]
         while missing := [name for name in names if not self._has_followed(name, session)]:
             if session != self.newest_session:
                 return
