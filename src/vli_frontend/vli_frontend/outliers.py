@@ -13,6 +13,7 @@ import numpy as np
 from numba import njit
 
 from vli_common.arrays import BoolArray, FloatArray, IntArray
+from vli_common.camera import CameraModel
 
 _MIN_POINTS = 8
 _HYPOTHESES = 60
@@ -24,11 +25,12 @@ class OutlierRejection:
     """Inliers of the epipolar geometry between consecutive frames.
 
     Args:
-        threshold: distance to the epipolar line, normalised image plane (pixels over f).
+        camera: of the calibration.
+        threshold_px: distance to the epipolar line, in the raw image: there the tracker's noise is the same all over.
     """
 
-    def __init__(self, threshold: float) -> None:
-        self._threshold = threshold
+    def __init__(self, camera: CameraModel, threshold_px: float) -> None:
+        self._camera, self._threshold_px = camera, threshold_px
         self._rng = np.random.default_rng(0)
 
     def reset(self) -> None:
@@ -45,10 +47,13 @@ class OutlierRejection:
         count = len(previous)
         if count < _MIN_POINTS:
             return np.ones(count, np.bool_)
+        jacobians = self._camera.jacobian(current)
         if rotation is None:
-            return _essential_inliers(previous, current, self._threshold)
+            # OpenCV takes one threshold for all rays.
+            px_per_ray = float(np.sqrt(np.median(np.linalg.det(jacobians))))
+            return _essential_inliers(previous, current, self._threshold_px / px_per_ray)
         pairs = self._rng.integers(0, count, (_HYPOTHESES, 2))
-        return translation_inliers(previous, current, np.ascontiguousarray(rotation), pairs, self._threshold)
+        return translation_inliers(previous, current, jacobians, np.ascontiguousarray(rotation), pairs, self._threshold_px)
 
 
 def _essential_inliers(previous: FloatArray, current: FloatArray, threshold: float) -> BoolArray:
@@ -58,15 +63,16 @@ def _essential_inliers(previous: FloatArray, current: FloatArray, threshold: flo
 
 @njit(cache=True, nogil=True)
 def translation_inliers(
-    previous: FloatArray, current: FloatArray, rotation: FloatArray, pairs: IntArray, threshold: float
+    previous: FloatArray, current: FloatArray, jacobians: FloatArray, rotation: FloatArray, pairs: IntArray, threshold_px: float
 ) -> BoolArray:
-    """Return (N,) True within ``threshold`` of the epipolar line of the best translation.
+    """Return (N,) True within ``threshold_px`` of the epipolar line of the best translation.
 
     Args:
         previous, current: rays (N, 2).
+        jacobians: (N, 2, 2) d pixel / d ray at the current ones.
         rotation: (3, 3), previous camera → current one.
         pairs: (M, 2) indices, two points a hypothesis; scored by the truncated quadratic (MSAC, Torr and Zisserman, 2000).
-        threshold: normalised image plane.
+        threshold_px: in the raw image.
     """
     turned = np.empty((len(previous), 3))
     for n in range(len(previous)):
@@ -82,14 +88,14 @@ def translation_inliers(
         direction /= norm
         score = 0.0
         for n in range(len(previous)):
-            error = _line_distance(turned[n], current[n], direction) / threshold
+            error = _line_distance_px(turned[n], current[n], direction, jacobians[n]) / threshold_px
             score += max(0.0, 1.0 - error * error)
         if score > best_score:
             best, best_score = direction, score
     inliers = np.ones(len(previous), np.bool_)
     if best_score >= 0.0:
         for n in range(len(previous)):
-            inliers[n] = _line_distance(turned[n], current[n], best) <= threshold
+            inliers[n] = _line_distance_px(turned[n], current[n], best, jacobians[n]) <= threshold_px
     return inliers
 
 
@@ -104,10 +110,14 @@ def _epipolar_normal(turned: FloatArray, current: FloatArray, n: int) -> FloatAr
 
 
 @njit(cache=True, nogil=True)
-def _line_distance(turned: FloatArray, current: FloatArray, direction: FloatArray) -> float:
-    """Return the distance of a ray from the epipolar line of its (rotated) partner, normalised image plane."""
+def _line_distance_px(turned: FloatArray, current: FloatArray, direction: FloatArray, jacobian: FloatArray) -> float:
+    """Return the distance of a ray from the epipolar line of its (rotated) partner, pixels of the raw image, to first order.
+
+    A line n·r = c of rays is J⁻ᵀ n · x = const on pixels.
+    """
     a = direction[1] * turned[2] - direction[2] * turned[1]
     b = direction[2] * turned[0] - direction[0] * turned[2]
     c = direction[0] * turned[1] - direction[1] * turned[0]
-    norm = math.sqrt(a * a + b * b)
-    return abs(a * current[0] + b * current[1] + c) / norm if norm > 1e-12 else 0.0
+    determinant = jacobian[0, 0] * jacobian[1, 1] - jacobian[0, 1] * jacobian[1, 0]
+    norm = math.hypot(jacobian[1, 1] * a - jacobian[1, 0] * b, jacobian[0, 0] * b - jacobian[0, 1] * a)
+    return abs((a * current[0] + b * current[1] + c) * determinant) / norm if norm > 1e-12 else 0.0

@@ -87,7 +87,7 @@ class Tracker:
         self._first_id = first_id
         self._camera, self._config, self._counters = camera, config, counters
         self._templates = PatchTemplates(config.max_features)
-        self._outliers = OutlierRejection(config.klt.outlier_px / camera.focal_px)
+        self._outliers = OutlierRejection(camera, config.klt.outlier_px)
         self.reset()
 
     def reset(self) -> None:
