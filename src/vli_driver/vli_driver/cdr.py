@@ -19,6 +19,8 @@ CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 
 _STORE = get_typestore(Stores.ROS2_JAZZY)
+_FRAME_LENGTH = slice(cdr.ENCAPSULATION + 8, cdr.ENCAPSULATION + 12)
+"""Where a message says how long its frame_id is: after the stamp."""
 
 __all__ = [
     "CAMERA_INFO",
@@ -80,7 +82,7 @@ def read_imus(messages: Sequence[bytes]) -> tuple[IntArray, FloatArray, FloatArr
     Raises:
         MessageError: one of the messages is malformed.
     """
-    if len({(len(data), data[: cdr.ENCAPSULATION]) for data in messages}) > 1 or not messages:
+    if len({(len(data), data[: cdr.ENCAPSULATION], data[_FRAME_LENGTH]) for data in messages}) > 1 or not messages:
         samples = [read_imu(data) for data in messages]
         stamps = np.array([sample.stamp_ns for sample in samples], dtype=np.int64)
         gyro, accel = ([getattr(sample, name) for sample in samples] for name in ("gyro", "accel"))

@@ -39,6 +39,14 @@ def test_messages_of_different_lengths_are_read_too() -> None:
     assert gyro[:, 0] == pytest.approx(0.1)
 
 
+def test_messages_of_one_length_that_are_laid_out_differently_are_read_as_each_is() -> None:
+    long = replace(imu(START_NS), header=T["std_msgs/msg/Header"](header(START_NS).stamp, "a_longer_frame_id"))
+    short, long = (bytes(STORE.serialize_cdr(message, message.__msgtype__)) for message in (imu(START_NS), long))
+    _, gyro, accel = cdr.read_imus([long, short + bytes(len(long) - len(short))])
+    assert np.array_equal(gyro[0], gyro[1])
+    assert np.array_equal(accel[0], accel[1])
+
+
 def test_a_malformed_message_is_an_error_of_its_own_and_dropped_from_a_bag(tmp_path: Path) -> None:
     good = bytes(STORE.serialize_cdr(imu(START_NS), "sensor_msgs/msg/Imu"))
     with pytest.raises(MessageError):
