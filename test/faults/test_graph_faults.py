@@ -142,7 +142,7 @@ def test_who_starts_late_gets_the_calibration_and_the_full_map(demo: Path, param
 
 
 @contextmanager
-def slowed(pids: list[int], share: float, period_s: float = 0.04) -> Iterator[None]:
+def slowed(pids: list[int], share: float, period_s: float = 0.1) -> Iterator[None]:
     """Give processes only a share of the time: stopped and continued in turn."""
     over = threading.Event()
 
@@ -171,7 +171,7 @@ def test_a_node_that_is_too_slow_leaves_out_the_oldest_says_so_and_its_queues_st
 ) -> None:
     with NodeProcesses(demo_graph(demo, _LOOP, rate=1.0, audience=LISTENER), parameter_file) as processes:
         wait(listener, lambda: text(listener, _BACK_END, "tracking") == "TRACKING", processes=processes)
-        with slowed([processes.pids[name]], 0.08):
+        with slowed([processes.pids[name]], 0.04):
             wait(listener, lambda: "too slow: " in listener.statuses[name].hint, 60.0, processes)
             waiting = [value for key, value in listener.statuses[name].values.items() if key.startswith("waiting.")]
             assert max(map(int, waiting)) < 300
