@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from vli_bringup.cli import main
+from vli_bringup.diagnosis import live
 from vli_bringup.diagnosis.camera import CameraCheck
 from vli_bringup.diagnosis.findings import Finding, Level, to_text, worst
 from vli_bringup.diagnosis.imu import ImuCheck, quietest_noise
@@ -13,6 +14,7 @@ from vli_bringup.diagnosis.stamps import check_stamps
 from vli_bringup.settings import Settings
 from vli_common.calibration import Calibration, ImuCalibration
 from vli_common.camera import make_camera
+from vli_common.node.transport import SHARED_MEMORY_PROFILE, UDP_PROFILE
 from vli_common.types import EncodedImage, ImuSample
 
 MS = 1_000_000
@@ -157,3 +159,11 @@ def test_it_wants_a_bag_or_a_live_sensor(capsys):
     assert main(["doctor"]) == 2
     assert main(["doctor", "none.mcap"]) == 2
     assert capsys.readouterr().err.count("\n") == 2
+
+
+@pytest.mark.parametrize(("profile", "told"), [(UDP_PROFILE, []), (SHARED_MEMORY_PROFILE, ["sockets"])])
+def test_sockets_that_linux_keeps_small_are_told_with_the_command_that_lets_them_grow(monkeypatch, profile, told):
+    monkeypatch.setattr(live, "local_profile", lambda: profile)
+    findings = live.socket_findings()
+    assert [finding.subject for finding in findings] == told
+    assert all("sysctl -w net.core.rmem_max=4194304" in finding.text for finding in findings)

@@ -15,7 +15,7 @@ from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPo
 from vli_bringup.diagnosis.findings import Finding, Level
 from vli_common.errors import MessageError
 from vli_common.messages import encoded_from_message, imu_from_message, status_from_message
-from vli_common.node.transport import message_type, quality, set_transport_profile
+from vli_common.node.transport import SHARED_MEMORY_PROFILE, local_profile, message_type, quality, set_transport_profile
 from vli_common.status import Health, StageStatus
 from vli_common.topics import IMAGE_RAW, IMAGE_RAW_COMPRESSED, IMU, NAMESPACE, STATUS, Topic
 from vli_common.types import EncodedImage, ImuSample
@@ -65,7 +65,7 @@ def _collect(node: Node, config: DriverConfig, seconds: float) -> Heard:
     publishers = {name: node.get_publishers_info_by_topic(name) for name in (*cameras, config.imu_topic)}
     heard.has_camera = any(publishers[name] for name in cameras)
     heard.has_imu = bool(publishers[config.imu_topic])
-    heard.findings += _topic_findings(publishers, heard, image, config.imu_topic)
+    heard.findings += [*socket_findings(), *_topic_findings(publishers, heard, image, config.imu_topic)]
     heard.findings += [_status_finding(status) for _, status in sorted(heard.statuses.items())]
     executor.shutdown(timeout_sec=0)
     node.destroy_node()
@@ -89,6 +89,14 @@ def _subscribe(node: Node, name: str, topic: Topic, take: Callable[[Any], None],
         durability=DurabilityPolicy.VOLATILE,
     )
     node.create_subscription(message_type(topic), name, handle, profile)
+
+
+def socket_findings() -> list[Finding]:
+    """Say where Linux does not allow the sockets that the nodes ask for: through shared memory a crash may hold up the others."""
+    if local_profile() != SHARED_MEMORY_PROFILE:
+        return []
+    text = "smaller than the nodes want, so a node that crashes may hold up all others: sudo sysctl -w net.core.rmem_max=4194304"
+    return [Finding(Level.WARNING, "sockets", text)]
 
 
 def _topic_findings(publishers: dict[str, list[Any]], heard: Heard, image: str, imu: str) -> list[Finding]:
