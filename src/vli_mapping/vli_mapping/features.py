@@ -7,13 +7,14 @@ images whose local mean and contrast are the same everywhere. Half of VGA is eno
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import cv2
 import numpy as np
 
 from vli_common.arrays import ByteArray, FloatArray
+from vli_common.camera import CameraModel
 
 DESCRIPTOR_BYTES = 32
 THUMBNAIL_WIDTH = 160
@@ -33,27 +34,35 @@ class ImageFeatures:
         pixels: (N, 2) float64, raw pixels of the image.
         descriptors: (N, 32) uint8, compared by Hamming distance.
         thumbnail: (H, 160) uint8, the image with local mean and contrast made equal.
+        scale: raw pixels per pixel of the image in which the corners were found.
     """
 
     pixels: FloatArray
     descriptors: ByteArray
     thumbnail: ByteArray
+    scale: float
 
     def __len__(self) -> int:
         return len(self.pixels)
+
+    def with_rays(self, camera: CameraModel) -> tuple[ImageFeatures, FloatArray]:
+        """Return the corners that have a viewing ray, and their rays (N, 2): a fisheye may see what is beyond 90°."""
+        rays = camera.unproject(self.pixels)
+        ahead = np.isfinite(rays).all(axis=1)
+        return replace(self, pixels=self.pixels[ahead], descriptors=self.descriptors[ahead]), rays[ahead]
 
 
 def describe_image(pixels: ByteArray) -> ImageFeatures:
     """Return the corners of an image (H, W, 3) BGR or (H, W) grey, the strongest first."""
     levelled = level(pixels, _WIDTH)
     thumbnail = _resized(levelled, THUMBNAIL_WIDTH)
+    scale = pixels.shape[1] / levelled.shape[1]
     corners, descriptors = _detector().detectAndCompute(levelled, None)
     if not len(corners):
-        return ImageFeatures(np.empty((0, 2)), np.empty((0, DESCRIPTOR_BYTES), np.uint8), thumbnail)
+        return ImageFeatures(np.empty((0, 2)), np.empty((0, DESCRIPTOR_BYTES), np.uint8), thumbnail, scale)
     order = np.argsort([-corner.response for corner in corners], kind="stable")
     where = np.array([corner.pt for corner in corners])[order]
-    scale = pixels.shape[1] / levelled.shape[1]
-    return ImageFeatures((where + 0.5) * scale - 0.5, np.ascontiguousarray(descriptors[order]), thumbnail)
+    return ImageFeatures((where + 0.5) * scale - 0.5, np.ascontiguousarray(descriptors[order]), thumbnail, scale)
 
 
 def level(pixels: ByteArray, width: int) -> ByteArray:

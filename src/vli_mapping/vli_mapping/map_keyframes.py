@@ -86,8 +86,7 @@ class KeyframeIntake:
         self._waiting.clear()
 
     def _describe(self, item: _Candidate, point_map: PointMap) -> MapKeyframe:
-        features = describe_image(item.pixels)
-        rays = self._camera.unproject(features.pixels)
+        features, rays = describe_image(item.pixels).with_rays(self._camera)
         points = meet(point_map, item.T_map_camera, rays, item.depth)
         there = np.isfinite(points).all(axis=1)
         return MapKeyframe(item.T_map_camera, item.depth, points[there], features.descriptors[there], features.thumbnail)

@@ -1,8 +1,8 @@
 """Where in the map an image was taken, by features: hypotheses of single views, and what all views together say of each.
 
 A feature looks for its like among those of all keyframes of the map; the keyframes with the most votes are matched one by one,
-and each gives a pose by PnP and RANSAC. Things repeat (a keyboard's keys every 19 mm), so a hypothesis counts by the matches of
-all views that agree with it, and against the best that is somewhere else.
+and each gives a pose by PnP and RANSAC (:mod:`vli_mapping.reprojection`). Things repeat (a keyboard's keys every 19 mm), so a
+hypothesis counts by the matches of all views that agree with it, and against the best that is somewhere else.
 """
 
 from __future__ import annotations
@@ -15,19 +15,16 @@ import numpy as np
 
 from vli_common.arrays import ByteArray, FloatArray, IntArray
 from vli_common.camera import CameraModel
-from vli_common.geometry import inverse, pose, so3_exp, transform
+from vli_common.geometry import inverse, transform
 from vli_mapping.features import ImageFeatures
 from vli_mapping.keyframe import MapKeyframe
+from vli_mapping.reprojection import MIN_MATCHES, TOLERANCE_PX, Matches, errors_px, joined, resect
 
 _MAX_DISTANCE = 64
 """Bits, of 256, in which descriptors of the same corner may differ."""
 _NEIGHBOURS, _KEYFRAMES = 6, 6
 _VOTERS = 150
 """Features of a map keyframe that vote, the strongest: their number decides what a large map costs."""
-_TOLERANCE_PX = 4.0
-"""Of a match: poses of the window and of the map, and the place of a corner at half resolution."""
-_RANSAC_ITERATIONS = 200
-_MIN_MATCHES = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,15 +34,13 @@ class Evidence:
     Args:
         stamp_ns: of the view.
         T_session_camera: (4, 4).
-        rays: (M, 2), of the features, undistorted, normalised; one that matches several keyframes is there several times.
-        points: (M, 3), map, what they match.
+        matches: M of them; a feature that matches several keyframes is there several times.
         features: (M,), which feature each is.
     """
 
     stamp_ns: int
     T_session_camera: FloatArray
-    rays: FloatArray
-    points: FloatArray
+    matches: Matches
     features: IntArray
 
 
@@ -69,26 +64,26 @@ class PlaceIndex:
 
     def match(self, stamp_ns: int, features: ImageFeatures, T_session_camera: FloatArray) -> tuple[Evidence, list[FloatArray]]:
         """Return the matches of an image with the keyframes most like it, and hypotheses T_map_session (4, 4) from each."""
-        rays = self._camera.unproject(features.pixels)
-        pairs = [(key, *self._pairs(features, key)) for key in self._most_alike(features)]
-        hypotheses = []
-        for key, mine, other in pairs:
-            T_map_camera = self._locate(self._keyframes[key].points[other], rays[mine])
+        features, rays = features.with_rays(self._camera)
+        px_per_ray = self._camera.jacobian(rays) / features.scale
+        parts, hypotheses, which = [Matches(np.empty((0, 3)), rays[:0], px_per_ray[:0])], [], [np.empty(0, np.int64)]
+        for key in self._most_alike(features):
+            mine, other = self._pairs(features, key)
+            part = Matches(self._keyframes[key].points[other], rays[mine], px_per_ray[mine])
+            T_map_camera = resect(part)
             if T_map_camera is not None:
                 hypotheses.append(T_map_camera @ inverse(T_session_camera))
-        which = np.concatenate([np.empty(0, np.int64), *(mine for _, mine, _ in pairs)])
-        points = np.concatenate([np.empty((0, 3)), *(self._keyframes[key].points[other] for key, _, other in pairs)])
-        return Evidence(stamp_ns, T_session_camera, rays[which], points, which), hypotheses
+            parts.append(part)
+            which.append(mine)
+        return Evidence(stamp_ns, T_session_camera, joined(parts), np.concatenate(which)), hypotheses
 
     def support(self, evidence: Sequence[Evidence], T_map_session: FloatArray) -> int:
         """Return how many features of all views are where the map says, if a hypothesis is true."""
-        limit = _TOLERANCE_PX / self._camera.focal_px
         total = 0
         for item in evidence:
-            local = transform(inverse(T_map_session @ item.T_session_camera), item.points)
-            with np.errstate(invalid="ignore", divide="ignore"):
-                off = np.hypot(*(local[:, :2] / local[:, 2:] - item.rays).T)
-            total += len(np.unique(item.features[(off < limit) & (local[:, 2] > 0)]))
+            local = transform(inverse(T_map_session @ item.T_session_camera), item.matches.points)
+            off = np.linalg.norm(errors_px(item.matches, local), axis=1)
+            total += len(np.unique(item.features[off < TOLERANCE_PX]))
         return total
 
     def _most_alike(self, features: ImageFeatures) -> list[int]:
@@ -102,7 +97,7 @@ class PlaceIndex:
         for row, near in zip(owners, distance <= _MAX_DISTANCE, strict=True):
             votes[np.unique(row[near])] += 1
         ranked = np.argsort(-votes, kind="stable")[:_KEYFRAMES]
-        return [int(key) for key in ranked if votes[key] >= _MIN_MATCHES]
+        return [int(key) for key in ranked if votes[key] >= MIN_MATCHES]
 
     def _pairs(self, features: ImageFeatures, key: int) -> tuple[IntArray, IntArray]:
         """Return the features of an image and those of a keyframe that are each other's nearest."""
@@ -112,24 +107,6 @@ class PlaceIndex:
         mine = np.arange(len(features))
         mutual = (to_mine[to_theirs[:, 0], 0] == mine) & (distance[:, 0] <= _MAX_DISTANCE)
         return mine[mutual], to_theirs[mutual, 0]
-
-    def _locate(self, points: FloatArray, rays: FloatArray) -> FloatArray | None:
-        """Return T_map_camera (4, 4) by PnP and RANSAC, whose random numbers OpenCV always seeds alike; None without one."""
-        if len(points) < _MIN_MATCHES:
-            return None
-        found, rotation, translation, inliers = cv2.solvePnPRansac(
-            np.ascontiguousarray(points),
-            np.ascontiguousarray(rays[:, None]),
-            np.eye(3),
-            None,
-            iterationsCount=_RANSAC_ITERATIONS,
-            reprojectionError=_TOLERANCE_PX / self._camera.focal_px,
-            flags=cv2.SOLVEPNP_AP3P,
-        )
-        if not found or inliers is None or len(inliers) < _MIN_MATCHES:
-            return None
-        T_camera_map = pose(so3_exp(np.asarray(rotation, np.float64)[:, 0]), np.asarray(translation, np.float64)[:, 0])
-        return inverse(T_camera_map) if np.isfinite(T_camera_map).all() else None
 
 
 def _nearest(queries: ByteArray, others: ByteArray, count: int) -> tuple[IntArray, IntArray]:

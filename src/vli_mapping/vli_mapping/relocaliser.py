@@ -185,7 +185,7 @@ class Relocaliser:
         target = _around(self._map, transform(T_map_session, source.points))
         if min(len(source.points), len(target.points)) < _MIN_OVERLAP:
             raise _InDoubtError("off_the_map")
-        return align_session(target, source, self._evidence, self._camera.focal_px, T_map_session)
+        return align_session(target, source, self._evidence, T_map_session)
 
     def _likeness(self, scans: Sequence[PosedScan], T_map_session: FloatArray) -> float:
         """Return the median correlation of views with what the map remembers of the same spots; 0 where nothing is shared."""
