@@ -34,11 +34,10 @@ from rclpy.utilities import get_rmw_implementation_identifier
 from vli_common.errors import VliError
 from vli_common.node.main import STOP_WITH_PARENT
 from vli_common.node.transport import message_type
-from vli_common.stop_signals import take_over
+from vli_common.stop_signals import held_back, take_over
 from vli_common.topics import TOPICS
 
 MESSAGE_BYTES = 65536
-_STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _NAME_BYTES = 15
 """Of a process, as the kernel keeps it."""
 
@@ -111,23 +110,20 @@ def _ended() -> list[tuple[int, int]]:
 def _fork(request: dict[str, Any], log: int, own: Iterable[int]) -> int:
     """Start a node that has none of the server's ``own`` file descriptors; return its process id."""
     parent = os.getpid()
-    # A signal that comes before the copy has its own handlers waits until it has.
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, _STOP_SIGNALS)
-    with warnings.catch_warnings():
+    with held_back(), warnings.catch_warnings():
         # Python 3.12 warns of LTTng's threads.
         warnings.simplefilter("ignore", DeprecationWarning)
         pid = os.fork()
-    if pid == 0:
-        signal.set_wakeup_fd(-1)
-        for descriptor in own:
-            os.close(descriptor)
-        os.environ.update(request["environment"], **{STOP_WITH_PARENT: str(parent)})
-        _become(request["module"], request["arguments"], log, before)
-    signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        if pid == 0:
+            signal.set_wakeup_fd(-1)
+            for descriptor in own:
+                os.close(descriptor)
+            os.environ.update(request["environment"], **{STOP_WITH_PARENT: str(parent)})
+            _become(request["module"], request["arguments"], log)
     return pid
 
 
-def _become(module: str, arguments: list[str], log: int, mask: Iterable[int]) -> NoReturn:
+def _become(module: str, arguments: list[str], log: int) -> NoReturn:
     """Be a node, as if started by ``python -m module arguments``."""
     try:
         # A session of its own: Ctrl-C is for the command, which has things to ask of the nodes before it stops them.
@@ -142,7 +138,6 @@ def _become(module: str, arguments: list[str], log: int, mask: Iterable[int]) ->
         Path("/proc/self/comm").write_text(name[:_NAME_BYTES])
         sys.argv[:] = [name, *arguments]
         take_over()
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         importlib.import_module(module).main()
     except BaseException:
         traceback.print_exc()

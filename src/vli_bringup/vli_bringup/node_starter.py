@@ -17,6 +17,7 @@ from typing import IO, Protocol
 
 from vli_bringup.graph import NodeDescription
 from vli_common.node.main import STOP_WITH_PARENT
+from vli_common.stop_signals import held_back
 
 _SERVER = "vli_bringup.node_server"
 _MESSAGE_BYTES = 65536
@@ -49,13 +50,17 @@ class Process(Protocol):
 
 
 def start_singly(node: NodeDescription, arguments: Sequence[str], log: IO[bytes], further: Mapping[str, str]) -> Process:
-    """Return a node as a process of its own, standard error to ``log``, with ``further`` variables in its environment."""
+    """Return a node as a process of its own, standard error to ``log``, with ``further`` variables in its environment.
+
+    A signal that comes before it has its handlers waits until it has.
+    """
     environment = {**os.environ, **further, STOP_WITH_PARENT: str(os.getpid())}
     command = [sys.executable, "-m", node.module, *arguments]
-    # A session of its own: Ctrl-C is for the command, which has things to ask of the nodes before it stops them.
-    return subprocess.Popen(
-        command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=log, env=environment, start_new_session=True
-    )
+    with held_back():
+        # A session of its own: Ctrl-C is for the command, which has things to ask of the nodes before it stops them.
+        return subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=log, env=environment, start_new_session=True
+        )
 
 
 class NodeServer:

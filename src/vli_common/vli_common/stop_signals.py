@@ -10,16 +10,33 @@ from __future__ import annotations
 import signal
 import sys
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 STOP = threading.Event()
 """Set by the first signal."""
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 def take_over() -> None:
-    """Let the signals set :data:`STOP`; call in the main thread."""
-    for number in (signal.SIGINT, signal.SIGTERM):
+    """Let the signals set :data:`STOP`, those too that :func:`held_back` has kept waiting; call in the main thread."""
+    for number in _SIGNALS:
         signal.signal(number, lambda *_: STOP.set())
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, _SIGNALS)
+
+
+@contextmanager
+def held_back() -> Iterator[None]:
+    """Keep the signals waiting: here until the block ends, in a process that is started in it until that calls :func:`take_over`.
+
+    Before Python is there a signal ends a process, or leaves it with a traceback, and only who starts it can prevent that.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def take_over_in_nodes(package: str) -> None:

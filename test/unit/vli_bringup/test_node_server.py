@@ -22,6 +22,7 @@ from vli_common.errors import VliError
 _START_S = 120.0
 _NODE = """
 import os, signal, sys, time, {imports}
+from vli_common.stop_signals import STOP, take_over
 def main():
     sys.stderr.write(f"{{sys.argv[1:]}} {{os.getsid(0) == os.getpid()}} {{os.environ.get('FURTHER')}} {{sys.stdin.read()!r}}\\n")
     sys.stderr.flush()
@@ -132,7 +133,7 @@ def test_libraries_with_threads_are_not_forked(package: Path) -> None:
 
 
 def test_nodes_are_loaded_one_by_one_where_the_server_cannot(package: Path) -> None:
-    node = write_node(package, "refusing_node", "signal.signal(signal.SIGINT, signal.SIG_DFL); time.sleep(60)")
+    node = write_node(package, "refusing_node", "take_over(); sys.exit(not STOP.wait(60))")
     (package / node.package / "warm_up.py").write_text("raise ValueError('not here')\n")
     (package / node.package / "nodes" / "refusing_node.py").open("a").write("\nif __name__ == '__main__': main()\n")
     (package / "vli.yaml").write_text("{}")

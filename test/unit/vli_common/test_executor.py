@@ -35,6 +35,7 @@ def node(monkeypatch: pytest.MonkeyPatch) -> Iterator[WorkingNode]:
     made = WorkingNode("spun_node")
     yield made
     assert made.close()
+    made.destroy_node()
     rclpy.try_shutdown()
 
 

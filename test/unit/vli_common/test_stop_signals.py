@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from vli_common.stop_signals import held_back
+
 _MODULE = """
 import os, signal
 import vli_common.stop_signals as stop_signals
@@ -42,3 +44,23 @@ def test_a_node_that_is_being_loaded_notes_the_signal_and_goes_on(package: Path)
 def test_a_process_that_only_imports_a_node_keeps_its_signals(package: Path) -> None:
     done = run(package, "-c", "import robot.nodes.some_node")
     assert done.returncode == -signal.SIGINT
+
+
+def test_a_signal_that_comes_before_python_is_there_waits_for_the_handler(package: Path) -> None:
+    (package / "robot" / "nodes" / "waiting_node.py").write_text(
+        "from vli_common.stop_signals import STOP\nprint(STOP.wait(60))\n"
+    )
+    with held_back():
+        process = subprocess.Popen(
+            [sys.executable, "-m", "robot.nodes.waiting_node"], cwd=package, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+        )
+    process.send_signal(signal.SIGTERM)
+    assert process.communicate() == (b"True\n", b"")
+    assert process.returncode == 0
+
+
+def test_who_holds_signals_back_gets_them_afterwards() -> None:
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    with held_back():
+        assert signal.pthread_sigmask(signal.SIG_BLOCK, ()) >= {signal.SIGINT, signal.SIGTERM}
+    assert signal.pthread_sigmask(signal.SIG_BLOCK, ()) == before

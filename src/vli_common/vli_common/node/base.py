@@ -16,7 +16,9 @@ from vli_common.calibration import Calibration, load_calibration, parse_calibrat
 from vli_common.errors import CalibrationError, MessageError
 from vli_common.messages import Session, session_from_message, session_to_message, status_from_message, status_to_message
 from vli_common.node.backlog import Backlog
+from vli_common.node.hooks import StageHooks
 from vli_common.node.inputs import Input
+from vli_common.node.neighbours import Neighbours, News, whole_number
 from vli_common.node.parameters import NodeConfig, NodeParameters
 from vli_common.node.transport import message_type, quality
 from vli_common.node.working import WorkingNode
@@ -30,17 +32,13 @@ _STATUS_PERIOD_S = 1.0
 _LOOK_PERIOD_S = 0.1
 _ABOUT_THE_NODE = {topic.name for topic in (STATUS, DIAGNOSTICS, SESSION, CALIBRATION)}
 _WAITING_HINT = "waiting for a calibration: give 'calibration_file' to the driver node or to this one"
-_MOST_OTHERS = 64
-"""Nodes that are kept in mind; a name costs a sender nothing."""
-_DIGITS = 20
-"""A number of more digits is none of ours."""
+_IGNORED = {News.NAMESAKE: "status_of_namesakes", News.TOO_MANY: "status_of_too_many_nodes"}
 
 
-class VliNode(WorkingNode):
+class VliNode(StageHooks, WorkingNode):
     """Parameters, calibration, session, worker, status, services, lifecycle.
 
-    A subclass makes its publishers and calls :meth:`receive` in its constructor, and overrides the hooks (``create_stage`` …
-    ``stage_health``), all of which run in the worker thread.
+    A subclass makes its publishers and calls :meth:`receive` in its constructor, and overrides what it needs of the hooks.
 
     Args:
         name: of the executable.
@@ -71,55 +69,20 @@ class VliNode(WorkingNode):
         """True where the message that is being handled came too long ago, and those before it too: leave out what can be."""
         self._told = ("", False)
         self._handled = 0
-        self._finished_sources: dict[str, dict[str, str]] = {}
         self._started_ns = time.time_ns()
-        self.others: dict[str, StageStatus] = {}
-        """The newest status of each node, this one too."""
+        self._neighbours = Neighbours(self.get_name(), self._started_ns)
         self._offered: Calibration | None = None
         self._connect()
-
-    # Hooks
-
-    def check(self) -> None:
-        """Raise where the node cannot be configured; runs in the main thread, before anything is made.
-
-        Raises:
-            VliError: what is missing or wrong.
-        """
-
-    def create_stage(self, calibration: Calibration | None) -> None:
-        """Make the stage objects (again, where parameters have changed) and warm their kernels."""
-
-    def drop_stage(self) -> None:
-        """Let go of the stage objects: the node is cleaned up."""
-
-    def on_session(self, session: Session) -> None:
-        """Drop all state of other sessions; ``self.session`` is the new one."""
-
-    def on_pause(self) -> None:
-        """Bring to an end what is under way."""
-
-    def on_resume(self) -> None:
-        """Begin, or go on after a pause."""
-
-    def on_finish(self) -> None:
-        """Process what is still held back: the input has ended."""
-
-    def on_restart(self, node: str) -> None:
-        """Another node of the graph has been started anew: what it knew is gone."""
-
-    def stage_counters(self) -> Counters:
-        """Return the counters of the stage."""
-        return Counters()
-
-    def stage_status(self) -> tuple[Health, str, dict[str, str]]:
-        """Return the stage's health, a hint in words, and further values."""
-        return Health.OK, "", {}
 
     @property
     def started_ns(self) -> int:
         """Wall clock at which the node was made: tells it from its predecessor of the same name."""
         return self._started_ns
+
+    @property
+    def others(self) -> Mapping[str, StageStatus]:
+        """The newest status of each node, this one too."""
+        return self._neighbours.statuses
 
     @property
     def newest_session(self) -> int:
@@ -189,7 +152,7 @@ class VliNode(WorkingNode):
     def publish_status(self) -> None:
         """Publish ``status`` and ``/diagnostics``."""
         status = self._status()
-        self.others[status.node] = status
+        self._neighbours.take(status)
         message = status_to_message(status)
         for topic in (STATUS, DIAGNOSTICS):
             self.send(topic, message)
@@ -313,7 +276,6 @@ class VliNode(WorkingNode):
         """Drop what waits, then let the stage start anew; data that come from now on are of the new session."""
         self._newest_session = session.number
         self.counters.add("dropped_by_session", self._worker.clear())
-        self._finished_sources.clear()
         for entry in self._inputs.values():
             entry.received = 0
 
@@ -337,33 +299,30 @@ class VliNode(WorkingNode):
         except MessageError:
             self.counters.add("status_malformed")
             return
-        previous = self.others.get(status.node)
-        if previous is None and len(self.others) >= _MOST_OTHERS:
-            self.counters.add("status_of_too_many_nodes")
+        news = self._neighbours.take(status)
+        if news in _IGNORED:
+            self.counters.add(_IGNORED[news])
             return
-        self.others[status.node] = status
-        if previous is not None and 0 < _number(previous, "started_ns") < _number(status, "started_ns"):
-            self._finished_sources.pop(status.node, None)
+        if news is News.RESTARTED:
             self.get_logger().warning(f"'{status.node}' was started anew")
             self.enqueue(partial(self.on_restart, status.node))
-        if _number(status, "session") > self._newest_session:
-            self._begin(Session(_number(status, "session"), f"heard of from {status.node}"))
+        if (session := whole_number(status, "session")) > self._newest_session:
+            self._begin(Session(session, f"heard of from {status.node}"))
         if status.values.get("session") == str(self._newest_session):
             self._note_sent(status)
-        if status.state is NodeState.FINISHED and status.values.get("session") == str(self.session):
-            self._finished_sources[status.node] = status.values
 
     def _note_sent(self, status: StageStatus) -> None:
         for name, entry in self._inputs.items():
             if f"sent.{name}" in status.values and status.node != self.get_name():
-                entry.note_sent(status.node, _number(status, f"sent.{name}"), self._newest_session)
+                entry.note_sent(status.node, whole_number(status, f"sent.{name}"), self._newest_session)
 
     def _check_finish(self) -> None:
         """Finish once every source has, and all that it sent has come and is worked off."""
         inputs = [entry for entry in self._inputs.values() if entry.ends]
         if self.state is not NodeState.READY or not inputs or not self._worker.is_idle:
             return
-        if all(entry.has_ended(self._finished_sources) for entry in inputs):
+        finished = self._neighbours.finished(self.session)
+        if all(entry.has_ended(finished) for entry in inputs):
 
             def finish() -> None:
                 self.on_finish()
@@ -395,7 +354,8 @@ class VliNode(WorkingNode):
         health, hint, values = self.stage_status()
         dropped = self._worker.dropped.values
         cut_off = next((entry.cut_off for entry in self._inputs.values() if entry.cut_off), "")
-        if dropped or cut_off:
+        twice = self._neighbours.hint
+        if dropped or cut_off or twice:
             health = Health.WARN if health is Health.OK else health
         if dropped:
             hint = hint or f"too slow: {', '.join(f'{count} of {name}' for name, count in dropped.items())} dropped"
@@ -406,7 +366,7 @@ class VliNode(WorkingNode):
             node=self.get_name(),
             health=health,
             state=self.state,
-            hint=self._hint or self._calibration_hint or cut_off or hint,
+            hint=self._hint or self._calibration_hint or twice or cut_off or hint,
             values={
                 "session": str(self.session),
                 "started_ns": str(self.started_ns),
@@ -428,9 +388,3 @@ class VliNode(WorkingNode):
         for prefix, counters in (("node", self.counters), ("stage", self.stage_counters())):
             figures |= {f"{prefix}.{name}": str(count) for name, count in list(counters.values.items())}
         return figures
-
-
-def _number(status: StageStatus, name: str) -> int:
-    """Return a whole number out of a status; 0 where it does not say."""
-    text = status.values.get(name, "")
-    return int(text) if text.isdecimal() and len(text) < _DIGITS else 0

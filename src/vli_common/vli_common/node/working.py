@@ -31,9 +31,11 @@ T = TypeVar("T")
 
 _QUEUE_DEPTHS = 12
 """The worker's queue holds this many times the depth of the topic."""
-_ASIDE_S = 1.0
-"""A service under way gets this long to end when the node is stopped."""
-_STOP_S = 2.0
+_ASIDE_S = 7.0
+"""A service under way, a map that is being saved, gets this long to end when the node is stopped: who stops nodes (``vli``,
+``ros2 launch``) kills those that have not ended after ten seconds."""
+_STOP_S = 1.0
+"""So does what the worker is doing; to compile a kernel cannot be interrupted."""
 _CALL_S = 10.0
 
 
@@ -183,12 +185,12 @@ class WorkingNode(ManagedNode):
         return stage
 
     def close(self) -> bool:
-        """Stop the worker and destroy the node; return False where a job would not end."""
+        """End the node's own threads, after the services under way; return False where a job would not end.
+
+        Nothing comes in any more; the node itself is there until it is destroyed.
+        """
         self._aside.finish(_ASIDE_S)
-        stopped = self._worker.stop(_STOP_S)
-        if stopped:
-            self.destroy_node()
-        return stopped
+        return self._worker.stop(_STOP_S)
 
     def _unmatched(self) -> str:
         return ",".join(entry.name for entry in self._inputs.values() if entry.is_unmatched)
