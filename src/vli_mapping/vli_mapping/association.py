@@ -20,7 +20,7 @@ from vli_mapping.insertion import colours_agree, normals_agree
 from vli_mapping.normals import MAX_NEIGHBOURS, fit_plane
 from vli_mapping.point_map import PointMap
 from vli_mapping.scan_window import PosedScan
-from vli_mapping.spatial_hash import bucket_of, cell_of, neighbours
+from vli_mapping.spatial_hash import bucket_of, cell_of, coordinates, neighbours
 
 _FULL_SUPPORT = 12.0
 """Map points of a plane from which on more do not make it weigh more."""
@@ -191,7 +191,7 @@ def _nearest_old(  # type: ignore[no-untyped-def]
                 for k in range(-shell, shell + 1, step):
                     at = heads[bucket_of(centre[0] + i, centre[1] + j, centre[2] + k, len(heads))]
                     while at >= 0:
-                        q = position[at]
+                        q = coordinates(position, at)
                         distance = (q[0] - p[0]) ** 2 + (q[1] - p[1]) ** 2 + (q[2] - p[2]) ** 2
                         if distance <= nearest:
                             seen = True

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from vli_mapping.spatial_hash import bucket_of, cell_of, same_cell
+from vli_mapping.spatial_hash import bucket_of, cell_of, coordinates, same_cell
 
 
 @njit(cache=True, nogil=True)
@@ -43,14 +43,14 @@ def cast(grid, columns, eye, ray, start, stop, radius, min_facing, rows, count):
     while reached < stop:
         at = heads[bucket_of(i, j, k, len(heads))]
         while at >= 0:
-            p = position[at]
+            p = coordinates(position, at)
             x, y, z = p[0] - eye[0], p[1] - eye[1], p[2] - eye[2]
             along = x * ray[0] + y * ray[1] + z * ray[2]
             if (
                 start <= along <= stop
                 and x * x + y * y + z * z - along * along < radius * radius
                 and same_cell(p, i, j, k, cell_m)
-                and not _grazes(normal[at], ray, min_facing)
+                and not _grazes(coordinates(normal, at), ray, min_facing)
             ):
                 total += weight[at] if solid[at] else 0.0
                 if count < len(rows):

@@ -60,6 +60,16 @@ def _buckets_for(capacity: int) -> int:
 
 
 @njit(cache=True, nogil=True)
+def coordinates(positions, index):  # type: ignore[no-untyped-def]
+    """Return x, y, z of one position.
+
+    To numba ``positions[index]`` is an array of its own, whose references are counted by atomic operations: that costs more than
+    the visit of a point.
+    """
+    return positions[index, 0], positions[index, 1], positions[index, 2]
+
+
+@njit(cache=True, nogil=True)
 def cell_of(coordinate, cell_m):  # type: ignore[no-untyped-def]
     """Return the index of the cell along one axis."""
     return np.int64(np.floor(coordinate / cell_m))
@@ -100,14 +110,14 @@ def unlink_one(heads, following, index, position, cell_m):  # type: ignore[no-un
 def link(heads, following, positions, start, stop, cell_m):  # type: ignore[no-untyped-def]
     """Link points [start, stop) of ``positions``."""
     for index in range(start, stop):
-        link_one(heads, following, index, positions[index], cell_m)
+        link_one(heads, following, index, coordinates(positions, index), cell_m)
 
 
 @njit(cache=True, nogil=True)
 def _link_again(heads, following, positions, linked, cell_m):  # type: ignore[no-untyped-def]
     for index in range(len(linked)):
         if linked[index]:
-            link_one(heads, following, index, positions[index], cell_m)
+            link_one(heads, following, index, coordinates(positions, index), cell_m)
 
 
 @njit(cache=True, nogil=True)
@@ -126,7 +136,7 @@ def neighbours(heads, following, positions, centre, radius, cell_m, found):  # t
             for k in range(cell_of(centre[2] - radius, cell_m), cell_of(centre[2] + radius, cell_m) + 1):
                 at = heads[bucket_of(i, j, k, len(heads))]
                 while at != NONE:
-                    p = positions[at]
+                    p = coordinates(positions, at)
                     distance = (p[0] - centre[0]) ** 2 + (p[1] - centre[1]) ** 2 + (p[2] - centre[2]) ** 2
                     if distance <= squared and count < len(found) and same_cell(p, i, j, k, cell_m):
                         found[count] = at
@@ -144,7 +154,7 @@ def any_near(heads, following, positions, centre, radius, cell_m):  # type: igno
             for k in range(cell_of(centre[2] - radius, cell_m), cell_of(centre[2] + radius, cell_m) + 1):
                 at = heads[bucket_of(i, j, k, len(heads))]
                 while at != NONE:
-                    p = positions[at]
+                    p = coordinates(positions, at)
                     if (p[0] - centre[0]) ** 2 + (p[1] - centre[1]) ** 2 + (p[2] - centre[2]) ** 2 <= squared:
                         return True
                     at = following[at]
