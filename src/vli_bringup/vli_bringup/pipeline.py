@@ -96,7 +96,7 @@ class Pipeline:
         is_image = isinstance(item, EncodedImage)
         events: list[Event] = []
         if jump := self._clock.jump("camera" if is_image else "IMU", item.stamp_ns):
-            events += self._begin_session(jump)
+            events += self._begin_session(jump.reason)
         if isinstance(item, ImuSample):
             self._queue.append(item)
             return events

@@ -95,8 +95,8 @@ class Demultiplexer:
     """Sorts frames into :class:`Exposure` as they come; ``Image.laser_on``, where known, decides alone.
 
     Counters: ``long``, ``short``, ``missing`` (periods without a frame), ``duplicate``, ``out_of_order``, ``clock_jump``,
-    ``phase_swap``, ``dark_long`` (a long frame as dark as a short one), ``ambient_light`` (a short frame as bright as a long one:
-    dropped), ``unclear`` (neither brightness nor rhythm tells: dropped).
+    ``played_again`` (a bag in a loop), ``phase_swap``, ``dark_long`` (a long frame as dark as a short one), ``ambient_light``
+    (a short frame as bright as a long one: dropped), ``unclear`` (neither brightness nor rhythm tells: dropped).
 
     Args:
         config: see :class:`DemuxConfig`.
@@ -105,11 +105,14 @@ class Demultiplexer:
     def __init__(self, config: DemuxConfig | None = None) -> None:
         self.config = config or DemuxConfig()
         self.counters = Counters()
-        self._clock = ClockMonitor()
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything but the counters: the next frame is the first of a stream."""
+        """Forget everything but the counters: the next frame is the first of a stream, whatever its stamp."""
+        self._clock = ClockMonitor()
+        self._begin()
+
+    def _begin(self) -> None:
         self.is_alternating: bool | None = None
         """True once long and short were told apart, False for a stream taken as all long, None while undecided."""
         self._last_ns: int | None = None
@@ -123,10 +126,10 @@ class Demultiplexer:
     def push(self, image: Image) -> SortedFrames:
         """Take the next image; return those that are decided by now, in order (none while the start is undecided)."""
         ready: SortedFrames = []
-        if self._clock.jump("camera", image.stamp_ns):
-            self.counters.add("clock_jump")
+        if jump := self._clock.jump("camera", image.stamp_ns):
+            self.counters.add(jump.counter)
             ready = self.flush()
-            self.reset()
+            self._begin()
         elif self._last_ns is not None and image.stamp_ns <= self._last_ns:
             self.counters.add("duplicate" if image.stamp_ns == self._last_ns else "out_of_order")
             return []

@@ -64,7 +64,7 @@ class BagPlayer:
         self._anchor = None
         for item in items:
             if jump := monitor.jump("camera" if isinstance(item, EncodedImage) else "IMU", item.stamp_ns):
-                self._on_jump(jump, item.stamp_ns)
+                self._on_jump(jump.reason, item.stamp_ns)
                 self._anchor = None
             self._wait_for(item.stamp_ns)
             if self._stopped.is_set():
@@ -85,6 +85,10 @@ class BagPlayer:
         """End at the present item."""
         self._stopped.set()
         self._running.set()
+
+    def rest(self, seconds: float) -> bool:
+        """Wait; return False at once where the playback was stopped."""
+        return not self._stopped.wait(seconds)
 
     def _wait_for(self, stamp_ns: int) -> None:
         if not self._running.is_set():

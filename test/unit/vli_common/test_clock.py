@@ -22,8 +22,17 @@ def test_a_steady_stream_with_gaps_and_swapped_frames_does_not_jump():
 def test_a_jump_is_told_in_words(step, said):
     answers = jumps([("camera", 100), ("camera", 100 + step), ("camera", 100.1 + step)])
     assert answers[0] is None
-    assert said in answers[1]
+    assert said in answers[1].reason
+    assert (answers[1].is_repeat, answers[1].counter) == (False, "clock_jump")
     assert answers[2] is None
+
+
+@pytest.mark.parametrize("again", [100.0, 100.5, 99.5])
+def test_a_stream_that_begins_again_where_it_began_is_a_bag_in_a_loop(again):
+    answers = jumps([("camera", 100), ("camera", 109), ("camera", 118), ("camera", again), ("camera", 109)])
+    assert answers[3].reason.startswith("the camera began again where it had begun, -1")
+    assert (answers[3].is_repeat, answers[3].counter) == (True, "played_again")
+    assert [answer is None for answer in answers] == [True, True, True, False, True]
 
 
 def test_all_streams_jump_once():

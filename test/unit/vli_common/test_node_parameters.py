@@ -88,3 +88,13 @@ def test_a_good_value_at_run_time_is_taken_and_noted() -> None:
     assert result.successful
     assert held.config(Outer).inner.level == 0.25
     assert held.changed
+
+
+def test_what_a_node_reads_once_cannot_be_set_later() -> None:
+    node = node_with(stripe__count=5)
+    held = NodeParameters(node, {Outer: "stripe"}, fixed=[Outer])
+    (result,) = node.set_parameters([Parameter("stripe.count", value=7)])
+    assert not result.successful
+    assert "read-only" in result.reason
+    assert held.config(Outer).count == 5
+    assert node.describe_parameter("stripe.inner.level").read_only

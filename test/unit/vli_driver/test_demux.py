@@ -152,6 +152,20 @@ def test_a_clock_that_jumps_back_begins_anew() -> None:
     assert demultiplexer.counters["clock_jump"] == 1
 
 
+@pytest.mark.parametrize(("is_told", "counted"), [(False, 1), (True, 0)])
+def test_a_bag_in_a_loop_is_no_jump_of_the_clock_and_a_stream_that_is_told_to_begin_is_neither(
+    is_told: bool, counted: int
+) -> None:
+    demultiplexer, frames = Demultiplexer(), stream(200)
+    out = [item for _, image in frames for item in demultiplexer.push(image)]
+    if is_told:
+        out += demultiplexer.flush()
+        demultiplexer.reset()
+    out += [item for _, image in frames for item in demultiplexer.push(image)]
+    assert out + demultiplexer.flush() == frames + frames
+    assert (demultiplexer.counters["clock_jump"], demultiplexer.counters["played_again"]) == (0, counted)
+
+
 def test_a_stream_that_does_not_alternate_is_all_long_after_two_seconds() -> None:
     frames = [(LONG, frame(k, LONG)) for k in range(200)]
     demultiplexer = Demultiplexer()

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import rclpy
+from rclpy.parameter import Parameter
 
 from vli_common.messages import image_to_cdr, scan_to_message, status_to_message
 from vli_common.node import inputs
@@ -77,3 +80,22 @@ def test_a_node_that_hears_nothing_of_what_another_sends_says_so_until_it_does(n
         "cut off: nothing has come of 210 messages of 'demux_node' on 'laser_points'; start this node again, else that one"
     )
     assert "cut off" not in said[-1].hint
+
+
+@pytest.mark.parametrize(("points", "saves"), [(1, ["under way", "last"]), (0, ["under way"])])
+def test_a_node_that_is_stopped_lets_an_automatic_save_end_and_saves_what_came_since(node, monkeypatch, points, saves):
+    done = []
+    monkeypatch.setattr(node, "_autosave", lambda: done.append("last"))
+    assert node.set_parameters([Parameter("autosave_s", value=60.0)])[0].successful
+    node._mapper, node._is_resumed = SimpleNamespace(map=[0.0] * points), True
+    assert node._saving.acquire(blocking=False)
+
+    def end() -> None:
+        done.append("under way")
+        node._saving.release()
+
+    timer = threading.Timer(0.2, end)
+    timer.start()
+    assert node.close()
+    timer.join()
+    assert done == saves

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -13,7 +13,7 @@ import rclpy
 from std_msgs.msg import Header, String
 
 from vli_common.calibration import Calibration, load_calibration, parse_calibration, to_yaml
-from vli_common.errors import CalibrationError, MessageError
+from vli_common.errors import CalibrationError, MessageError, VliError
 from vli_common.messages import Session, session_from_message, session_to_message, status_from_message, status_to_message
 from vli_common.node.backlog import Backlog
 from vli_common.node.hooks import StageHooks
@@ -32,6 +32,7 @@ _STATUS_PERIOD_S = 1.0
 _LOOK_PERIOD_S = 0.1
 _ABOUT_THE_NODE = {topic.name for topic in (STATUS, DIAGNOSTICS, SESSION, CALIBRATION)}
 _WAITING_HINT = "waiting for a calibration: give 'calibration_file' to the driver node or to this one"
+_RUNNING = (NodeState.READY, NodeState.PAUSED, NodeState.FINISHED)
 _IGNORED = {News.NAMESAKE: "status_of_namesakes", News.TOO_MANY: "status_of_too_many_nodes"}
 
 
@@ -44,14 +45,17 @@ class VliNode(StageHooks, WorkingNode):
         name: of the executable.
         configs: config dataclass → prefix of its parameters (``""`` for none).
         needs_calibration: False for a node that works without one.
+        fixed: those of ``configs`` that the node reads in its constructor.
 
     Raises:
         ConfigError: an invalid parameter.
     """
 
-    def __init__(self, name: str, configs: Mapping[type, str], needs_calibration: bool = True) -> None:
+    def __init__(
+        self, name: str, configs: Mapping[type, str], needs_calibration: bool = True, fixed: Collection[type] = ()
+    ) -> None:
         super().__init__(name)
-        self.parameters = NodeParameters(self, configs)
+        self.parameters = NodeParameters(self, configs, fixed)
         self.node_config = self.parameters.config(NodeConfig)
         self.mode = Mode(self.node_config.mode)
         self.calibration: Calibration | None = None
@@ -150,12 +154,13 @@ class VliNode(StageHooks, WorkingNode):
         self.call(drop)
 
     def publish_status(self) -> None:
-        """Publish ``status`` and ``/diagnostics``."""
+        """Publish ``status`` and ``/diagnostics``: all scanners share that, so that there the namespace is part of the name."""
         status = self._status()
         self._neighbours.take(status)
         message = status_to_message(status)
-        for topic in (STATUS, DIAGNOSTICS):
-            self.send(topic, message)
+        self.send(STATUS, message)
+        message.status[0].name = self.get_fully_qualified_name().lstrip("/")
+        self.send(DIAGNOSTICS, message)
 
     def _connect(self) -> None:
         for topic in (STATUS, DIAGNOSTICS, SESSION):
@@ -286,7 +291,8 @@ class VliNode(StageHooks, WorkingNode):
                 self.create_stage(self.calibration)
             if self.state in (NodeState.READY, NodeState.FINISHED, NodeState.PAUSED, NodeState.INACTIVE):
                 self.on_session(session)
-                self.state = NodeState.READY if self.state is NodeState.FINISHED else self.state
+            if self.state is NodeState.FINISHED:
+                self.state = NodeState.READY if self.is_active else NodeState.INACTIVE
             self.publish_status()
 
         self.enqueue(begin)
@@ -332,7 +338,18 @@ class VliNode(StageHooks, WorkingNode):
 
     # Services and status
 
+    def _check_running(self) -> None:
+        """Raise where to pause or resume would come to nothing.
+
+        Raises:
+            VliError: the node is not at work.
+        """
+        if self.state not in _RUNNING:
+            raise VliError(f"{self.get_name()} is '{self.state.value}', expected {', '.join(state.value for state in _RUNNING)}")
+
     def _pause(self) -> str:
+        self._check_running()
+
         def pause() -> None:
             if self.state is NodeState.READY:
                 self.on_pause()
@@ -342,6 +359,8 @@ class VliNode(StageHooks, WorkingNode):
         return "pausing"
 
     def _resume(self) -> str:
+        self._check_running()
+
         def resume() -> None:
             if self.state is NodeState.PAUSED:
                 self.on_resume()

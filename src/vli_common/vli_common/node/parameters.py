@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, replace
 from typing import TypeVar
 
@@ -68,25 +68,26 @@ class NodeParameters:
     Args:
         node: that declares them.
         configs: config dataclass → prefix of its parameters (``"stripe"``, or ``""``).
+        fixed: those of ``configs`` that the node reads once, when it starts: to set them later is refused.
 
     Raises:
         ConfigError: unknown names and invalid values among the overrides, all at once.
     """
 
-    def __init__(self, node: Node, configs: Mapping[type, str]) -> None:
+    def __init__(self, node: Node, configs: Mapping[type, str], fixed: Collection[type] = ()) -> None:
         self._node = node
         self._configs: dict[type, str] = {**configs, NodeConfig: ""}
         self.changed = False
         """True where a stage parameter was set since the stage was made; it takes effect with the next session."""
-        fixed = {spec.name for spec in parameters(NodeConfig)}
-        self._specs = {
-            _dotted(prefix, spec.name): replace(spec, name=_dotted(prefix, spec.name))
+        specs = {
+            config_type: [replace(spec, name=_dotted(prefix, spec.name)) for spec in parameters(config_type)]
             for config_type, prefix in self._configs.items()
-            for spec in parameters(config_type)
         }
+        self._specs = {spec.name: spec for group in specs.values() for spec in group}
         self._check_overrides()
-        for name, spec in self._specs.items():
-            node.declare_parameter(name, spec.default, descriptor(spec, read_only=name in fixed))
+        for config_type, group in specs.items():
+            for spec in group:
+                node.declare_parameter(spec.name, spec.default, descriptor(spec, config_type in (NodeConfig, *fixed)))
         node.add_on_set_parameters_callback(self._check)
         node.add_post_set_parameters_callback(self._note)
 

@@ -37,6 +37,7 @@ _ASIDE_S = 7.0
 _STOP_S = 1.0
 """So does what the worker is doing; to compile a kernel cannot be interrupted."""
 _CALL_S = 10.0
+_JOB_S = 60.0
 
 
 class WorkingNode(ManagedNode):
@@ -159,19 +160,28 @@ class WorkingNode(ManagedNode):
         """Run a job in the worker, after all that waits there, and return its result; for services.
 
         Raises:
-            TimeoutError: the worker did not come to it in 10 s.
+            VliError: the worker did not come to it in 10 s, and will not any more, or was still at it after another 60 s.
             Exception: what the job raised.
         """
         future: Future[T] = Future()
 
         def run() -> None:
+            if not future.set_running_or_notify_cancel():
+                return
             try:
                 future.set_result(job())
             except Exception as error:
                 future.set_exception(error)
 
         self.enqueue(run)
-        return future.result(_CALL_S)
+        with suppress(TimeoutError):
+            return future.result(_CALL_S)
+        if future.cancel():
+            raise VliError(f"{self.get_name()} was busy for {_CALL_S:g} s: nothing was done; try again")
+        try:
+            return future.result(_JOB_S)
+        except TimeoutError as error:
+            raise VliError(f"{self.get_name()} is still at it after {_CALL_S + _JOB_S:g} s") from error
 
     @staticmethod
     def existing(stage: T | None) -> T:

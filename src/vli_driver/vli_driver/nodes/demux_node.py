@@ -42,10 +42,10 @@ class InputTopics:
 
 
 class DemuxNode(VliNode):
-    """Demultiplexer and stripe scanner; a jump of the camera's clock begins a new session."""
+    """Demultiplexer and stripe scanner; a jump of the camera's clock, or a bag that begins again, begins a new session."""
 
     def __init__(self) -> None:
-        super().__init__("demux_node", {DemuxConfig: "demux", StripeConfig: "stripe", InputTopics: ""})
+        super().__init__("demux_node", {DemuxConfig: "demux", StripeConfig: "stripe", InputTopics: ""}, fixed=[InputTopics])
         self._demultiplexer = Demultiplexer(self.parameters.config(DemuxConfig))
         self._scanner: StripeScanner | None = None
         self._joiner: ExposureJoiner | None = None
@@ -106,7 +106,8 @@ class DemuxNode(VliNode):
         if not isinstance(item, EncodedImage):
             return
         if jump := self._jumps.jump("camera", item.stamp_ns):
-            self.raise_session(jump, item.stamp_ns)
+            self._demultiplexer.counters.add(jump.counter)
+            self.raise_session(jump.reason, item.stamp_ns)
             self.enqueue(lambda: self._sort(item))
             return
         self._sort(item)

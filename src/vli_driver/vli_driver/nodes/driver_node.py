@@ -9,7 +9,6 @@ from pathlib import Path
 from std_msgs.msg import String
 
 from vli_common.calibration import Calibration, to_yaml
-from vli_common.errors import VliError
 from vli_common.messages import encoded_to_cdr, exposure_to_message, imu_to_cdr
 from vli_common.node import VliNode, run_node
 from vli_common.status import Health, NodeState
@@ -20,6 +19,8 @@ from vli_driver.config import DriverConfig
 from vli_driver.player import BagPlayer, PlaybackConfig
 
 _POLL_S = 0.02
+_JOIN_S = 1.0
+"""A playback that was stopped ends after the item that it reads or publishes."""
 _SETTLE_S = 0.3
 """A writer may know its reader a moment later than the reader knows its writer."""
 _DRAIN_S = 5.0
@@ -34,7 +35,7 @@ class DriverNode(VliNode):
     """
 
     def __init__(self) -> None:
-        super().__init__("driver_node", {DriverConfig: "", PlaybackConfig: ""}, needs_calibration=False)
+        super().__init__("driver_node", {DriverConfig: "", PlaybackConfig: ""}, needs_calibration=False, fixed=[PlaybackConfig])
         self._playback = self.parameters.config(PlaybackConfig)
         self._player = self._make_player()
         self._thread: threading.Thread | None = None
@@ -87,7 +88,7 @@ class DriverNode(VliNode):
     def _stop_playing(self) -> None:
         self._player.stop()
         if self._thread is not None:
-            self._thread.join(1.0)
+            self._thread.join(_JOIN_S)
 
     def _make_player(self) -> BagPlayer:
         return BagPlayer(self._playback.rate, self._publish_item, self._on_jump)
@@ -104,7 +105,8 @@ class DriverNode(VliNode):
     def _play(self) -> None:
         try:
             self._play_all()
-        except VliError as error:
+        except Exception as error:
+            # As for the worker: the node ends, rather than stay and play nothing.
             self.fail(error)
 
     def _play_all(self) -> None:
@@ -127,12 +129,11 @@ class DriverNode(VliNode):
     def _wait_until_finished(self) -> None:
         """Return when the awaited nodes have finished: a new session drops what they hold back for images that follow."""
         deadline_s = time.monotonic() + _DRAIN_S
-        while time.monotonic() < deadline_s:
+        while time.monotonic() < deadline_s and self._player.rest(_POLL_S):
             awaited = [self.others[name] for name in self._awaited() if name in self.others]
             # Who only listens counts nothing as handled, and never finishes.
             if all(status.state is NodeState.FINISHED for status in awaited if "handled" in status.values):
                 return
-            time.sleep(_POLL_S)
 
     def _awaited(self) -> list[str]:
         return [name.strip() for name in self._playback.wait_for.split(",") if name.strip()]
@@ -147,10 +148,11 @@ class DriverNode(VliNode):
         while number != self.newest_session:
             number = self.raise_session(reason, stamp_ns).number
             self._wait_for_all(number, deadline_s)
-            time.sleep(_SETTLE_S)
+            if not self._player.rest(_SETTLE_S):
+                return
 
     def _wait_for_all(self, session: int, deadline_s: float) -> None:
-        """Return when the awaited nodes are of the session, the session is no more the newest, or it takes too long."""
+        """Return when the awaited nodes are of the session, it is no more the newest, it takes too long, or all is stopped."""
         names = [self.get_name(), *self._awaited()]
         while missing := [name for name in names if not self._has_followed(name, session)]:
             if session != self.newest_session:
@@ -158,7 +160,8 @@ class DriverNode(VliNode):
             if time.monotonic() > deadline_s:
                 self.get_logger().warning(f"playing without {', '.join(missing)}: not ready in {self._playback.wait_timeout:g} s")
                 return
-            time.sleep(_POLL_S)
+            if not self._player.rest(_POLL_S):
+                return
 
     def _has_followed(self, name: str, session: int) -> bool:
         status = self.others.get(name)

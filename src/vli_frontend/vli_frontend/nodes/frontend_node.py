@@ -47,7 +47,7 @@ class FrontEndNode(VliNode):
     """Tracks, keyframes, preintegration."""
 
     def __init__(self) -> None:
-        super().__init__("frontend_node", {FrontEndConfig: "", InputTopics: ""})
+        super().__init__("frontend_node", {FrontEndConfig: "", InputTopics: ""}, fixed=[InputTopics])
         self._front_end: FrontEnd | None = None
         for topic in (TRACKS, PREINTEGRATION):
             self.advertise(topic)

@@ -32,11 +32,15 @@ from vli_mapping.light import Light
 from vli_mapping.map_file import SUFFIX, load_map, map_origin, save_map
 from vli_mapping.mapper import Mapper
 from vli_mapping.mesh import make_mesh, write_mesh
-from vli_mapping.snapshot import Snapshot, restore, take
+from vli_mapping.photographs import develop
+from vli_mapping.point_map import PointMap
+from vli_mapping.snapshot import Snapshot, restore, take, view
 from vli_mapping.warm_up import warm_up
 
 _MAP_PERIOD_S = 2.0
 _AUTOSAVE_CHECK_S = 0.2
+_LAST_SAVE_S = 5.0
+"""An automatic save that is under way when the node is stopped gets this long, before the last one."""
 _BACK_END = WINDOW.sources[0]
 _WAITING_IMAGES = 300
 """Ten seconds of long images, as many as the mapper keeps: a scan whose images were dropped would stay grey. 280 MB at VGA."""
@@ -175,7 +179,8 @@ class MappingNode(VliNode):
 
     def close(self) -> bool:
         """Save a last time where the map is saved automatically, then stop."""
-        if self._is_resumed and self.parameters.config(StoreConfig).autosave_s and self._saving.acquire(blocking=False):
+        has_more = self._is_resumed and self.parameters.config(StoreConfig).autosave_s and self._mapper and len(self._mapper.map)
+        if has_more and self._saving.acquire(timeout=_LAST_SAVE_S):
             self._autosave()
         return super().close()
 
@@ -211,7 +216,7 @@ class MappingNode(VliNode):
                 kept = path.with_stem(f"{path.stem}_previous")
                 path.replace(kept)
                 self.get_logger().info(f"keeps the map of an earlier session as '{kept}'")
-        except (VliError, TimeoutError, OSError) as error:
+        except (VliError, OSError) as error:
             self.get_logger().error(f"map of an earlier session: {error}")
         finally:
             self._is_resumed = True
@@ -223,27 +228,31 @@ class MappingNode(VliNode):
         try:
             snapshot = self._snapshot(path)
             save_map(path, replace(snapshot, origin=self._origin))
-        except (VliError, TimeoutError) as error:
+        except VliError as error:
             self.get_logger().error(f"automatic save: {error}", throttle_duration_sec=60.0)
         finally:
             self._saving.release()
 
     def _save_all(self, path: Path) -> int:
         """Write all of the map; return how many points it has."""
-        snapshot = self._with_window(path)
-        save_map(path, replace(snapshot, origin=self._origin))
-        return len(snapshot)
+        whole, light = self._finished(path)
+        save_map(path, replace(view(whole, light), origin=self._origin))
+        return len(whole)
 
-    def _with_window(self, path: Path) -> Snapshot:
-        """Return the map with the scans of the window as they are now; the map itself gets them when their poses are final."""
-        waiting = self.call(self.mapper.waiting)
-        if not waiting:
-            return self._snapshot(path)
+    def _finished(self, path: Path) -> tuple[PointMap, Light | None]:
+        """Return a copy of the map as it were if the scan ended here, and the light on board.
+
+        With the scans of the window as they are now; the map itself gets them when their poses are final.
+        """
+        waiting, photographs = self.call(self.mapper.waiting), self.call(self.mapper.photographs)
         snapshot = take(self.mapper.map, self.call(self._settled_light), self.call)
         whole = restore(snapshot, self.parameters.config(MappingConfig).map)
         for stripe in waiting:
             whole.insert(stripe)
-        return take(whole, snapshot.light)
+        if not len(whole):
+            raise OutputError(f"the map is empty, '{path}' is not written")
+        develop(whole, snapshot.light, self.mapper.camera, photographs)
+        return whole, snapshot.light
 
     def _snapshot(self, path: Path) -> Snapshot:
         light = self.call(self._settled_light)
@@ -258,8 +267,7 @@ class MappingNode(VliNode):
 
     def _cloud(self, path: Path) -> PointCloud:
         as_seen = self.parameters.config(MappingConfig).colour == AS_SEEN
-        snapshot = self._with_window(path)
-        return finished_cloud(restore(snapshot), snapshot.light, as_seen)
+        return finished_cloud(*self._finished(path), as_seen)
 
     def _path(self, name: str) -> Path:
         return Path(getattr(self.parameters.config(StoreConfig), name)).absolute()
