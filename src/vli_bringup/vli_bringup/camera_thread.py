@@ -1,13 +1,14 @@
 """The camera's part of the pipeline in a thread of its own: what driver and demultiplexer do in processes of theirs.
 
-While the main thread follows and estimates a long frame, its short frame is decoded and triangulated. Kernels, codecs and OpenCV
-release the interpreter, so two cores do the work of two; what comes out does not depend on who was faster.
+While the main thread follows and estimates a long frame, its short frame is decoded and triangulated, and the next long one made
+ready for the front end. Kernels, codecs and OpenCV release the interpreter, so two cores do the work of two; what comes out does
+not depend on who was faster.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -17,6 +18,7 @@ from vli_common.types import Counters, EncodedImage, Exposure, Image, LaserScan
 from vli_driver.decode import decode
 from vli_driver.demux import Demultiplexer
 from vli_driver.scanner import StripeScanner
+from vli_frontend.photometry import Frame
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,12 +29,14 @@ class SortedImage:
         exposure: long or short.
         image: decoded.
         scan: the stripe of a short one, eq. (1); None for a long one and where there is no scanner.
+        frame: a long one as the front end takes it; None for a short one.
         costs: seconds by stage, of the thread that did the work.
     """
 
     exposure: Exposure
     image: Image
     scan: LaserScan | None
+    frame: Frame | None
     costs: dict[str, float]
 
 
@@ -57,12 +61,14 @@ class CameraThread:
 
     Args:
         demultiplexer, scanner: as they are wired by the pipeline; nobody else may use them meanwhile. No scanner: no stripe.
+        prepare: the front end's, see :meth:`FrontEnd.prepare`.
     """
 
-    def __init__(self, demultiplexer: Demultiplexer, scanner: StripeScanner | None) -> None:
+    def __init__(self, demultiplexer: Demultiplexer, scanner: StripeScanner | None, prepare: Callable[[Image], Frame]) -> None:
         self.counters = Counters()
         self._demultiplexer = demultiplexer
         self._scanner = scanner
+        self._prepare = prepare
         self._worker = ThreadPoolExecutor(1, thread_name_prefix="camera")
         self._image_shape: tuple[int, ...] | None = None
         self._costs: dict[int, _Costs] = {}
@@ -93,8 +99,11 @@ class CameraThread:
 
     def _scanned(self, exposure: Exposure, image: Image) -> SortedImage:
         costs = self._costs.pop(image.stamp_ns, _Costs())
-        scan = None
-        if exposure is Exposure.SHORT and self._scanner is not None:
+        scan = frame = None
+        if exposure is Exposure.LONG:
+            with costs.measure("frontend"):
+                frame = self._prepare(image)
+        elif self._scanner is not None:
             with costs.measure("stripe"):
                 scan = self._scanner.scan(image)
-        return SortedImage(exposure, image, scan, costs.seconds)
+        return SortedImage(exposure, image, scan, frame, costs.seconds)

@@ -81,7 +81,7 @@ class Pipeline:
         self._counters = Counters()
         self._mode = mode
         self._clock = ClockMonitor()
-        self._camera = CameraThread(stages.demultiplexer, stages.scanner)
+        self._camera = CameraThread(stages.demultiplexer, stages.scanner, stages.front_end.prepare)
         self._mapping = MappingThread(stages.mapper, self.timer)
         self._queue: deque[Future[list[SortedImage]] | ImuSample] = deque()
         self._images_waiting = 0
@@ -159,7 +159,7 @@ class Pipeline:
             return
         self._mapping.add_image(item.image)
         with self.timer.charge("frontend"):
-            frames = self.stages.front_end.add_image(item.image)
+            frames = self.stages.front_end.add_image(item.image, item.frame)
         yield from self._estimate(frames)
 
     def _add_scan(self, scan: LaserScan | None) -> None:

@@ -23,7 +23,7 @@ from vli_common.types import (
 from vli_frontend.config import FrontEndConfig
 from vli_frontend.keyframes import FrameVerdict, KeyframeRule
 from vli_frontend.motion_hint import MotionHint
-from vli_frontend.photometry import make_frame
+from vli_frontend.photometry import Frame, make_frame
 from vli_frontend.preintegration import Preintegrator
 from vli_frontend.stripe_distance import StripeDistance
 from vli_frontend.synchroniser import ImuSegment, ReadyFrame, Synchroniser, seconds_to_ns
@@ -127,14 +127,23 @@ class FrontEnd:
             return self._release()
         return []
 
-    def add_image(self, image: Image) -> list[FrontEndOutput]:
-        """Take a long frame; return those that are complete."""
+    def prepare(self, image: Image) -> Frame:
+        """Return what following a long frame needs of its image alone; changes nothing, so that another thread may ask ahead."""
+        return make_frame(image, self._config.klt.normalisation_px)
+
+    def add_image(self, image: Image, prepared: Frame | None = None) -> list[FrontEndOutput]:
+        """Take a long frame; return those that are complete.
+
+        Args:
+            image: the long frame.
+            prepared: of the image, see :meth:`prepare`; made here where it is None.
+        """
         camera = self._calibration.camera
         if image.session != self._session:
             self.counters.add("frames_of_other_session")
         elif image.pixels.shape[:2] != (camera.height, camera.width):
             self.counters.add("frames_of_wrong_size")
-        elif self._synchroniser.add_frame(image):
+        elif self._synchroniser.add_frame(prepared or self.prepare(image)):
             return self._release()
         return []
 
@@ -146,10 +155,9 @@ class FrontEnd:
 
     def _process(self, ready: ReadyFrame) -> FrontEndOutput:
         """Follow the tracks, judge the frame, detect new points on a keyframe, preintegrate."""
-        stamp_ns = ready.image.stamp_ns
+        frame, stamp_ns = ready.frame, ready.frame.stamp_ns
         segment = self._segment(stamp_ns) if ready.covered else None
         rotation = self._rotation(segment)
-        frame = make_frame(ready.image, self._config.klt.normalisation_px)
         before = len(self._tracker.tracks)
         self._tracker.follow(frame, (stamp_ns - (self._previous_ns or 0)) / NANOSECONDS, rotation)
         if self._previous_ns is not None:

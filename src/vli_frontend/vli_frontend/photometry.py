@@ -29,11 +29,13 @@ class Frame:
     """The versions of a long frame that tracking needs, uint8.
 
     Args:
+        stamp_ns: of the image.
         grey: (H, W), low-passed by [1 2 1]² (demosaicing leaves artefacts at the highest frequencies).
         half: (H/2, W/2), half the size; pixel (x, y) lies at (2x, 2y) of ``grey``.
         normalised: (H/2, W/2), (half − local mean) / local standard deviation, mid-grey 128.
     """
 
+    stamp_ns: int
     grey: ByteArray
     half: ByteArray
     normalised: ByteArray
@@ -44,7 +46,8 @@ def make_frame(image: Image, window_px: int) -> Frame:
     grey = cv2.cvtColor(image.pixels, cv2.COLOR_BGR2GRAY) if image.is_colour else np.ascontiguousarray(image.pixels)
     grey = cv2.GaussianBlur(grey, (3, 3), 0)
     half = cast(ByteArray, cv2.pyrDown(grey))
-    return Frame(cast(ByteArray, grey), half, half if window_px < 3 else normalise_locally(half, 2 * (window_px // 4) + 1))
+    normalised = half if window_px < 3 else normalise_locally(half, 2 * (window_px // 4) + 1)
+    return Frame(image.stamp_ns, cast(ByteArray, grey), half, normalised)
 
 
 def normalise_locally(grey: ByteArray, window_px: int) -> ByteArray:

@@ -9,8 +9,9 @@ from enum import Enum
 import numpy as np
 
 from vli_common.arrays import FloatArray, IntArray
-from vli_common.types import NANOSECONDS, Counters, Image, ImuSample
+from vli_common.types import NANOSECONDS, Counters, ImuSample
 from vli_frontend.imu_gaps import HOLE, period_ns
+from vli_frontend.photometry import Frame
 
 _CAPACITY = 8192
 _MAX_WAITING = 32
@@ -148,7 +149,7 @@ class Waiting(Enum):
 class ReadyFrame:
     """A long frame that may go on; ``covered`` tells whether the IMU reaches its stamp."""
 
-    image: Image
+    frame: Frame
     covered: bool
 
 
@@ -174,7 +175,7 @@ class Synchroniser:
         """May be changed at any time; holds for what is asked from then on."""
         self._max_wait_ns, self._uses_imu = max_wait_ns, uses_imu
         self._counters = counters
-        self._waiting: deque[Image] = deque()
+        self._waiting: deque[Frame] = deque()
         self._newest_frame_ns: int | None = None
 
     def clear(self) -> None:
@@ -198,13 +199,13 @@ class Synchroniser:
         self._counters.add("imu_out_of_order")
         return True
 
-    def add_frame(self, image: Image) -> bool:
+    def add_frame(self, frame: Frame) -> bool:
         """Take a long frame; False where it was dropped."""
         newest = self._newest_frame_ns
-        if newest is not None and image.stamp_ns <= newest:
-            return self._drop("frames_duplicate" if image.stamp_ns == newest else "frames_out_of_order")
-        self._newest_frame_ns = image.stamp_ns
-        self._waiting.append(image)
+        if newest is not None and frame.stamp_ns <= newest:
+            return self._drop("frames_duplicate" if frame.stamp_ns == newest else "frames_out_of_order")
+        self._newest_frame_ns = frame.stamp_ns
+        self._waiting.append(frame)
         if len(self._waiting) > _MAX_WAITING:
             self._waiting.popleft()
             self._counters.add("frames_overrun")

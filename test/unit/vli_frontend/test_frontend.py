@@ -215,6 +215,20 @@ def test_two_runs_are_identical_also_after_a_reset(items: Items, outputs: list[F
         np.testing.assert_array_equal(first.tracks.flags, second.tracks.flags)
 
 
+def test_frames_prepared_ahead_are_followed_as_those_prepared_on_arrival(items: Items, outputs: list[FrontEndOutput]) -> None:
+    front_end = make()
+    prepared = {item.stamp_ns: front_end.prepare(item) for item in items if isinstance(item, Image)}
+    found: list[FrontEndOutput] = []
+    for item in items:
+        if isinstance(item, Image):
+            found += front_end.add_image(item, prepared[item.stamp_ns])
+        else:
+            found += front_end.add_imu(item)
+    assert len(found) == len(outputs)
+    for ahead, arrived in zip(found, outputs, strict=True):
+        np.testing.assert_array_equal(ahead.tracks.pixels, arrived.tracks.pixels)
+
+
 def test_imu_samples_that_are_stale_or_come_twice_change_nothing_but_a_counter(
     items: Items, outputs: list[FrontEndOutput]
 ) -> None:

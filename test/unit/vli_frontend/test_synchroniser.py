@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vli_common.types import Counters, Image, ImuSample
+from vli_common.types import Counters, ImuSample
+from vli_frontend.photometry import Frame
 from vli_frontend.synchroniser import ImuHistory, ReadyFrame, Synchroniser, Waiting
 
 MS = 1_000_000
@@ -15,8 +16,9 @@ def sample(stamp_ns: int, value: float = 0.0) -> ImuSample:
     return ImuSample(stamp_ns, np.full(3, value), np.full(3, 10 * value))
 
 
-def image(stamp_ns: int) -> Image:
-    return Image(stamp_ns, np.zeros((4, 4), np.uint8))
+def frame(stamp_ns: int) -> Frame:
+    pixels = np.zeros((4, 4), np.uint8)
+    return Frame(stamp_ns, pixels, pixels[::2, ::2], pixels[::2, ::2])
 
 
 @pytest.fixture
@@ -32,13 +34,13 @@ def synchroniser(counters: Counters) -> Synchroniser:
 def covered_stamps(synchroniser: Synchroniser) -> list[tuple[int, bool]]:
     out = []
     while isinstance(ready := synchroniser.next(), ReadyFrame):
-        out.append((ready.image.stamp_ns, ready.covered))
+        out.append((ready.frame.stamp_ns, ready.covered))
     return out
 
 
 def test_a_frame_goes_on_with_the_first_sample_at_or_after_its_stamp(synchroniser: Synchroniser) -> None:
     assert synchroniser.next() is Waiting.NO_FRAME
-    synchroniser.add_frame(image(100 * MS))
+    synchroniser.add_frame(frame(100 * MS))
     assert synchroniser.next() is Waiting.NO_IMU
     synchroniser.add_imu(sample(99 * MS))
     assert synchroniser.next() is Waiting.IMU_BEHIND
@@ -48,7 +50,7 @@ def test_a_frame_goes_on_with_the_first_sample_at_or_after_its_stamp(synchronise
 
 def test_the_time_shift_moves_the_frame_on_the_clock_of_the_imu(counters: Counters) -> None:
     synchroniser = Synchroniser(8 * MS, 50 * MS, True, counters)
-    synchroniser.add_frame(image(100 * MS))
+    synchroniser.add_frame(frame(100 * MS))
     synchroniser.add_imu(sample(105 * MS))
     assert synchroniser.next() is Waiting.IMU_BEHIND
     synchroniser.add_imu(sample(110 * MS))
@@ -58,30 +60,30 @@ def test_the_time_shift_moves_the_frame_on_the_clock_of_the_imu(counters: Counte
 def test_an_imu_that_runs_far_ahead_of_the_images_still_covers_them(synchroniser: Synchroniser, counters: Counters) -> None:
     for k in range(100):
         synchroniser.add_imu(sample(k * 5 * MS))
-    synchroniser.add_frame(image(101 * MS))
+    synchroniser.add_frame(frame(101 * MS))
     assert covered_stamps(synchroniser) == [(101 * MS, True)]
     assert counters.values == {}
 
 
 def test_without_the_imu_each_frame_goes_on_at_once(counters: Counters) -> None:
     synchroniser = Synchroniser(0, 50 * MS, False, counters)
-    synchroniser.add_frame(image(100 * MS))
+    synchroniser.add_frame(frame(100 * MS))
     assert covered_stamps(synchroniser) == [(100 * MS, False)]
 
 
 def test_a_frame_does_not_wait_longer_than_allowed_for_a_dead_imu(synchroniser: Synchroniser, counters: Counters) -> None:
     synchroniser.add_imu(sample(95 * MS))
-    synchroniser.add_frame(image(100 * MS))
-    synchroniser.add_frame(image(133 * MS))
+    synchroniser.add_frame(frame(100 * MS))
+    synchroniser.add_frame(frame(133 * MS))
     assert synchroniser.next() is Waiting.IMU_BEHIND
-    synchroniser.add_frame(image(167 * MS))
+    synchroniser.add_frame(frame(167 * MS))
     assert covered_stamps(synchroniser) == [(100 * MS, False)]
     assert counters["frames_without_imu"] == 1
 
 
 def test_a_sample_after_a_long_gap_does_not_count_as_cover(synchroniser: Synchroniser) -> None:
     synchroniser.add_imu(sample(95 * MS))
-    synchroniser.add_frame(image(100 * MS))
+    synchroniser.add_frame(frame(100 * MS))
     synchroniser.add_imu(sample(151 * MS))
     assert covered_stamps(synchroniser) == [(100 * MS, False)]
 
@@ -92,9 +94,9 @@ def test_what_is_too_late_duplicated_or_not_finite_is_dropped_and_counted(synchr
     assert not synchroniser.add_imu(sample(5 * MS))
     assert not synchroniser.add_imu(sample(15 * MS, np.nan))
     assert not synchroniser.add_imu(sample(15 * MS, np.inf))
-    assert synchroniser.add_frame(image(10 * MS))
-    assert not synchroniser.add_frame(image(10 * MS))
-    assert not synchroniser.add_frame(image(9 * MS))
+    assert synchroniser.add_frame(frame(10 * MS))
+    assert not synchroniser.add_frame(frame(10 * MS))
+    assert not synchroniser.add_frame(frame(9 * MS))
     assert counters.values == {
         "imu_duplicate": 1,
         "imu_too_late": 1,
@@ -124,7 +126,7 @@ def test_a_late_sample_is_put_where_it_belongs(synchroniser: Synchroniser, count
 def test_a_frame_waits_for_the_sample_that_seems_to_be_missing_before_it(synchroniser: Synchroniser) -> None:
     for k in range(40):
         synchroniser.add_imu(sample(5 * k * MS))
-    synchroniser.add_frame(image(198 * MS))
+    synchroniser.add_frame(frame(198 * MS))
     synchroniser.add_imu(sample(205 * MS))
     assert synchroniser.next() is Waiting.IMU_BEHIND
     synchroniser.add_imu(sample(200 * MS))
@@ -134,7 +136,7 @@ def test_a_frame_waits_for_the_sample_that_seems_to_be_missing_before_it(synchro
 def test_a_frame_does_not_wait_for_a_sample_that_is_lost(synchroniser: Synchroniser) -> None:
     for k in range(40):
         synchroniser.add_imu(sample(5 * k * MS))
-    synchroniser.add_frame(image(198 * MS))
+    synchroniser.add_frame(frame(198 * MS))
     synchroniser.add_imu(sample(205 * MS))
     synchroniser.add_imu(sample(210 * MS))
     assert covered_stamps(synchroniser) == [(198 * MS, True)]
@@ -153,7 +155,7 @@ def test_late_samples_find_their_place_in_a_full_history() -> None:
 def test_too_many_waiting_frames_lose_the_oldest(counters: Counters) -> None:
     synchroniser = Synchroniser(0, 10_000 * MS, True, counters)
     for k in range(40):
-        synchroniser.add_frame(image(k * MS))
+        synchroniser.add_frame(frame(k * MS))
     assert counters["frames_overrun"] == 8
     synchroniser.add_imu(sample(100 * MS))
     assert [stamp for stamp, _ in covered_stamps(synchroniser)] == [k * MS for k in range(8, 40)]
