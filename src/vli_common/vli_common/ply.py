@@ -36,13 +36,25 @@ def write_cloud(path: Path, cloud: PointCloud) -> None:
     Raises:
         OutputError: the file cannot be written.
     """
+    try:
+        dump_cloud(path, cloud)
+    except OSError as error:
+        raise OutputError(f"'{path}' cannot be written: {error.strerror}") from error
+
+
+def dump_cloud(path: Path, cloud: PointCloud) -> None:
+    """Write as :func:`write_cloud` does, for who writes to a name of his own.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
     rows = np.zeros(len(cloud), _VERTEX)
     _set(rows, ("x", "y", "z"), cloud.points)
     _set(rows, _COLOUR, cloud.colours)
     if cloud.normals is not None:
         _set(rows, _NORMAL, cloud.normals)
     rows["weight"] = 1.0 if cloud.weights is None else cloud.weights
-    _write(path, [PlyElement.describe(rows, "vertex")])
+    PlyData([PlyElement.describe(rows, "vertex")], byte_order="<").write(str(path))
 
 
 def read_cloud(path: Path) -> PointCloud:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import io
+import os
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -70,34 +73,42 @@ def _write_las(path: Path, cloud: PointCloud) -> None:
     las.red, las.green, las.blue = (cloud.colours.astype(np.uint16) * 257).T
     if cloud.normals is not None:
         las.normal_x, las.normal_y, las.normal_z = cloud.normals.T
+    # In memory first: what compresses LAZ has errors of its own for a file without room.
+    memory = io.BytesIO()
     try:
-        las.write(str(path))
+        las.write(memory, do_compress=path.suffix.lower() == ".laz")
     except laspy.errors.LaspyException as error:
         raise OutputError(
             f"'{path}' cannot be written: {error}; pip install 'vli_mapping[{EXTRA}]' has what LAZ needs"
         ) from error
+    path.write_bytes(memory.getbuffer())
 
 
 def _write_e57(path: Path, cloud: PointCloud) -> None:
-    """Write one E57 scan with colours, in the frame of the map."""
+    """Write one E57 scan with colours, in the frame of the map.
+
+    In memory first: libE57 that finds no room in a file throws again from its destructors, and says so on the terminal.
+    """
     pye57 = optional("pye57", EXTRA)
-    path.unlink(missing_ok=True)
     data: dict[str, AnyArray] = {
         f"cartesian{axis.upper()}": cloud.points[:, index].astype(np.float64) for index, axis in enumerate("xyz")
     }
     data |= {f"color{name}": cloud.colours[:, index].copy() for index, name in enumerate(("Red", "Green", "Blue"))}
-    try:
-        file = pye57.E57(str(path), mode="w")
+    with os.fdopen(os.memfd_create(path.name), "rb") as memory:
         try:
-            file.write_scan_raw(data)
-        finally:
-            file.close()
-    except pye57.libe57.E57Exception as error:
-        raise OSError(0, str(error).splitlines()[0]) from error
+            file = pye57.E57(f"/proc/self/fd/{memory.fileno()}", mode="w")
+            try:
+                file.write_scan_raw(data)
+            finally:
+                file.close()
+        except pye57.libe57.E57Exception as error:
+            raise OSError(0, str(error).splitlines()[0]) from error
+        with path.open("wb") as stream:
+            shutil.copyfileobj(memory, stream)
 
 
 CLOUD_WRITERS: dict[str, Callable[[Path, PointCloud], None]] = {
-    ".ply": ply.write_cloud,
+    ".ply": ply.dump_cloud,
     ".pcd": _write_pcd,
     ".las": _write_las,
     ".laz": _write_las,

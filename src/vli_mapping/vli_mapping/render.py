@@ -74,7 +74,7 @@ def draw_views(cloud: PointCloud, size: tuple[int, int] = SHEET, caption: str = 
     if len(cloud) == 0:
         _text(sheet, "no map points", (_MARGIN, height // 2), 1.0, _TEXT)
         return sheet
-    cloud = _thinned(cloud)
+    count, cloud = len(cloud), _thinned(cloud)
     points = cloud.points.astype(np.float64)
     spacing = point_spacing(points)
     colours, normals = _exposed(cloud.colours), _normals(cloud)
@@ -83,7 +83,7 @@ def draw_views(cloud: PointCloud, size: tuple[int, int] = SHEET, caption: str = 
         panel = sheet[y : y + h, x : x + w]
         panel[:] = draw(points, colours, normals, view, spacing, panel)
         _label(sheet[y - _TITLE : y, x : x + w], view)
-    _text(sheet, caption or f"{len(cloud):,} points".replace(",", " "), (_MARGIN, height - 14), 0.5, _FAINT)
+    _text(sheet, caption or f"{count:,} points".replace(",", " "), (_MARGIN, height - 14), 0.5, _FAINT)
     return sheet
 
 

@@ -19,7 +19,7 @@ def write_ply(path: Path, cloud: PointCloud) -> None:
         OutputError: the file cannot be written; what was at ``path`` before is still there.
     """
     with replacing(path) as partial:
-        ply.write_cloud(partial, cloud)
+        ply.dump_cloud(partial, cloud)
 
 
 @contextmanager

@@ -1,5 +1,9 @@
 from __future__ import annotations
 
+import errno
+import os
+import resource
+import shutil
 import sys
 from pathlib import Path
 
@@ -63,6 +67,42 @@ def test_e57_has_points_and_colours(cloud: PointCloud, tmp_path: Path) -> None:
     for index, (axis, colour) in enumerate(zip("XYZ", ("Red", "Green", "Blue"), strict=True)):
         np.testing.assert_array_equal(back[f"cartesian{axis}"].astype(np.float32), cloud.points[:, index])
         np.testing.assert_array_equal(back[f"color{colour}"], cloud.colours[:, index])
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".pcd", ".las", ".laz"])
+def test_a_full_disk_is_told_by_the_name_that_was_asked_for_and_leaves_the_old_file(
+    cloud: PointCloud, tmp_path: Path, suffix: str
+) -> None:
+    pytest.importorskip("laspy")
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(b"old")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4000, limits[1]))
+    try:
+        with pytest.raises(OutputError, match=f"^'{path}' cannot be written: File too large$"):
+            write_cloud(path, cloud)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert [item.name for item in tmp_path.iterdir()] == [path.name]
+    assert path.read_bytes() == b"old"
+
+
+def test_an_e57_that_finds_no_room_is_one_line_and_leaves_the_old_file(
+    cloud: PointCloud, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("pye57")
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    path = tmp_path / "a.e57"
+    path.write_bytes(b"old")
+    monkeypatch.setattr(shutil, "copyfileobj", full)
+    with pytest.raises(OutputError, match=f"^'{path}' cannot be written: No space left on device$"):
+        write_cloud(path, cloud)
+    assert [item.name for item in tmp_path.iterdir()] == ["a.e57"]
+    assert path.read_bytes() == b"old"
+    assert capfd.readouterr() == ("", "")
 
 
 def test_an_unknown_ending_names_those_that_are_known(cloud: PointCloud, tmp_path: Path) -> None:
