@@ -14,4 +14,5 @@ def warm_up() -> None:
     geometry.so3_log(geometry.so3_exp(np.zeros(3)))
     geometry.inverse(geometry.orthonormalised(geometry.interpolate(T, T, 0.5)))
     geometry.quaternion_from_rotation(T[:3, :3])
-    make_camera("radtan", (100.0, 100.0, 64.0, 48.0), (0.0, 0.0, 0.0, 0.0), (128, 96)).unproject(np.zeros((1, 2)))
+    camera = make_camera("radtan", (100.0, 100.0, 64.0, 48.0), (0.0, 0.0, 0.0, 0.0), (128, 96))
+    camera.to_pixels(camera.unproject(np.zeros((1, 2))))
