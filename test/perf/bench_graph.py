@@ -40,7 +40,7 @@ from vli_bringup.graph import describe_graph
 from vli_bringup.processes import GraphError
 from vli_bringup.tum import read_tum
 from vli_common.arrays import FloatArray
-from vli_common.node.transport import remove_dead_segments
+from vli_common.node.shared_memory import remove_dead_segments
 
 DATA = Path(__file__).resolve().parents[3] / "shared/data/keyboard_short"
 RATES = (1.0, 1.25, 1.5, 1.75, 2.0, 2.5, 3.0)

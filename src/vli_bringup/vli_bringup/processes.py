@@ -19,7 +19,8 @@ import yaml
 from vli_bringup.graph import NodeDescription
 from vli_bringup.node_starter import NodeServer, Process, ServedProcess, last_line, start_singly
 from vli_common.errors import VliError
-from vli_common.node.transport import remove_dead_segments, use_fresh_ports
+from vli_common.node.shared_memory import remove_dead_segments
+from vli_common.node.transport import use_fresh_ports
 
 MAX_RESTARTS = 3
 """Of one node within a minute."""

@@ -16,7 +16,8 @@ from vli_common.errors import VliError
 from vli_common.node.base import VliNode
 from vli_common.node.executor import SPINNER, Spinner
 from vli_common.node.leaving import leave_after
-from vli_common.node.transport import remove_dead_segments, set_transport_profile
+from vli_common.node.shared_memory import remove_dead_segments
+from vli_common.node.transport import set_transport_profile
 from vli_common.stop_signals import STOP, take_over
 
 _SWITCH_S = 2e-4

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import fcntl
 import functools
 import importlib
 import os
-import re
 import socket
 from pathlib import Path
 from typing import Any
@@ -18,7 +16,6 @@ from vli_common.topics import Topic
 _PROFILE_VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
 _RANGE_VARIABLE, _LOCALHOST, _AS_THE_PROFILE_SAYS = "ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST", "SYSTEM_DEFAULT"
 _READER_FACTOR = 8
-_SEGMENT_LOCK = re.compile(r"fastrtps_[0-9a-f]{16}_el")
 _FIRST_PORT, _PORT_STEP, _PORT_STEPS = 11, 32, 7
 """Offset of the first participant's port for data within the 250 of a domain (RTPS 2.2, 9.6.1.1), and how far others move it."""
 _RECEIVE_BYTES = 4_194_304
@@ -86,30 +83,6 @@ def _environment(profile: Path) -> dict[str, str]:
         # to 32 ports instead of once to the group.
         variables[_RANGE_VARIABLE] = _AS_THE_PROFILE_SAYS
     return variables
-
-
-def remove_dead_segments(directory: Path = Path("/dev/shm")) -> int:
-    """Remove the shared memory of Fast DDS that killed processes have left, as ``fastdds shm clean`` does; return how many.
-
-    A process that lives holds a lock on ``fastrtps_ID_el`` beside its segment ``fastrtps_ID``. One that is killed leaves both.
-    """
-    removed = 0
-    for lock in directory.glob("fastrtps_*_el"):
-        if _SEGMENT_LOCK.fullmatch(lock.name) and not _is_locked(lock):
-            for path in (lock.with_name(lock.name.removesuffix("_el")), lock):
-                path.unlink(missing_ok=True)
-            removed += 1
-    return removed
-
-
-def _is_locked(path: Path) -> bool:
-    """Return True where a process holds the lock, or it is not ours to ask."""
-    try:
-        with path.open("r+b") as stream:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        return True
-    return False
 
 
 def quality(topic: Topic, reading: bool = False) -> QoSProfile:
