@@ -1,8 +1,8 @@
 """What killed processes leave of Fast DDS in ``/dev/shm``, and its removal: what ``fastdds shm clean`` removes, and ports.
 
 A process has a segment ``fastrtps_ID`` for what it sends, 16 MB, and a lock on ``fastrtps_ID_el`` while it lives. It listens on
-ports, ``fastrtps_portN``, 52 kB each, with a lock on ``…_el`` or, where others may listen too, ``…_sl``, and a semaphore. The last
-that uses a port removes it; a process that was killed is counted for ever.
+ports, ``fastrtps_portN`` of 52 kB, with a lock on ``…_el`` or, where others may listen too, ``…_sl``, and a semaphore. Who uses a
+port last removes it; a process that was killed is counted for ever.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ DIRECTORY = Path("/dev/shm")
 _SEGMENT_LOCK = re.compile(r"fastrtps_[0-9a-f]{16}_el")
 _PORT = re.compile(r"fastrtps_port\d+")
 _LOCKS = ("_el", "_sl")
-_YOUNG_S = 2.0
+_YOUNG_S = 0.5
 """A port that is being made has no user yet."""
 
 
