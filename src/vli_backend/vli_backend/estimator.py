@@ -386,7 +386,7 @@ class WindowEstimator:
 
     def _keyframe_poses(self) -> FloatArray:
         """Return ``T_map_camera`` (K, 4, 4) of the window."""
-        result: FloatArray = np.stack([state.T_map_imu for state in self._smoother.states()]) @ self._T_imu_cam
+        result: FloatArray = self._smoother.poses() @ self._T_imu_cam
         return result
 
     def _bias(self, session: int) -> ImuBias:

@@ -99,6 +99,9 @@ class Smoother(Protocol):
     def states(self) -> list[KeyframeState]:
         """Return all states in the window, oldest first."""
 
+    def poses(self) -> FloatArray:
+        """Return ``T_map_imu`` (K, 4, 4) of the window, oldest first."""
+
     def newest_covariance(self) -> FloatArray:
         """Return the (6, 6) marginal covariance of the newest pose, [ω, v] in imu_link."""
 
@@ -169,7 +172,7 @@ class GtsamSmoother:
 
     def hold_scale(self, ratio: float, relative_sigma: float) -> None:
         """See :meth:`Smoother.hold_scale`."""
-        positions = self._poses()[:, :3, 3]
+        positions = self.poses()[:, :3, 3]
         distances = np.linalg.norm(positions[:, None] - positions, axis=2)
         i, j = np.unravel_index(int(np.argmax(distances)), distances.shape)
         distance = ratio * float(distances[i, j])
@@ -190,10 +193,10 @@ class GtsamSmoother:
 
     def solve(self, condenser: Condenser, iterations: int) -> int:
         """See :meth:`Smoother.solve`."""
-        poses = self._poses()
+        poses = self.poses()
         for iteration in range(iterations):
             self._replace(self._to_container(condenser(poses)))
-            moved = self._poses()
+            moved = self.poses()
             step_m = float(np.abs(moved[:, :3, 3] - poses[:, :3, 3]).max())
             step_rad = float(np.abs(moved[:, :3, :3] - poses[:, :3, :3]).max())
             poses = moved
@@ -203,7 +206,7 @@ class GtsamSmoother:
 
     def marginalise_oldest(self, leaving: Condenser, staying: Condenser) -> None:
         """See :meth:`Smoother.marginalise_oldest`."""
-        poses = self._poses()
+        poses = self.poses()
         newest = self._first + self._count - 1
         stay = self._to_container(staying(poses), skip=1)
         graph = gtsam.NonlinearFactorGraph()
@@ -244,7 +247,8 @@ class GtsamSmoother:
             raise SmootherError(f"no covariance: {_first_line(error)}") from error
         return np.asarray(np.linalg.inv(root.T @ root))
 
-    def _poses(self) -> FloatArray:
+    def poses(self) -> FloatArray:
+        """See :meth:`Smoother.poses`."""
         return np.stack([self._estimate.atPose3(X(k)).matrix() for k in range(self._first, self._first + self._count)])
 
     def _to_container(self, quadratic: Quadratic, skip: int = 0) -> gtsam.LinearContainerFactor:
