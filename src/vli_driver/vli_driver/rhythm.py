@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 
-import numpy as np
-
 _HISTORY = 16
 _SAME_KIND = 0.4
 """Intervals within this share of the lower quartile are single periods; the others span dropped frames."""
@@ -25,12 +23,12 @@ class Rhythm:
         self.slot = 0
 
     def advance(self, step_ns: int) -> tuple[int, bool]:
-        """Move on by the interval to the next frame; return how many periods it spans and whether that count is reliable."""
+        """Move on by the interval to the next frame, > 0; return how many periods it spans and whether that count is reliable."""
         self._intervals.append(step_ns)
-        recent = np.array(self._intervals, dtype=np.float64)
-        single = np.sort(recent)[(len(recent) - 1) // 4]
+        single = sorted(self._intervals)[(len(self._intervals) - 1) // 4]
         # Mid-exposures of long and short frames need not be evenly spaced: the mean over both kinds is the period.
-        period = recent[np.abs(recent / single - 1) < _SAME_KIND].mean()
+        same = [interval for interval in self._intervals if abs(interval / single - 1) < _SAME_KIND]
+        period = sum(same) / len(same)
         count = max(round(step_ns / period), 1)
         self.slot += count
-        return count, bool(abs(step_ns / period - count) < _MAX_PHASE_ERROR and step_ns < self._max_gap_ns)
+        return count, abs(step_ns / period - count) < _MAX_PHASE_ERROR and step_ns < self._max_gap_ns
