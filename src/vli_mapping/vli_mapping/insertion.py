@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from vli_mapping.spatial_hash import bucket_of, cell_of, link_one, same_cell, unlink_one
+from vli_mapping.spatial_hash import bucket_of, cell_of, coordinates, link_one, same_cell, unlink_one
 
 ROWS, FREE_HEAD, FREE = 0, 1, 2
 """Of the state (3,): rows in use, first of the chain of free rows among them (−1: none), and how many these are."""
@@ -38,7 +38,7 @@ def insert_stripe(  # type: ignore[no-untyped-def]
         for index in range(len(points)):
             if stripe_solid[index] != wanted:
                 continue
-            p = points[index]
+            p = coordinates(points, index)
             target[index] = -1
             if not wanted and _covered(heads, following, cell_m, position, solid, p, fill_radius):
                 continue
@@ -86,7 +86,7 @@ def _covered(heads, following, cell_m, position, solid, p, radius):  # type: ign
             for k in range(cell_of(p[2] - radius, cell_m), cell_of(p[2] + radius, cell_m) + 1):
                 at = heads[bucket_of(i, j, k, len(heads))]
                 while at >= 0:
-                    if solid[at] and squared_distance(position[at], p) <= radius * radius:
+                    if solid[at] and squared_distance(coordinates(position, at), p) <= radius * radius:
                         return True
                     at = following[at]
     return False
@@ -134,7 +134,7 @@ def squared_distance(a, b):  # type: ignore[no-untyped-def]
 def _nearest_compatible(heads, following, cell_m, columns, p, stripe, index, radius, limits):  # type: ignore[no-untyped-def]
     """Return the row of the nearest point, as solid as the stripe's, that agrees in normal and colour; −1 where there is none."""
     position, normal, colour, solid = columns[0], columns[1], columns[2], columns[9]
-    n, c, wanted = stripe[1][index], stripe[2][index], stripe[5][index]
+    n, c, wanted = coordinates(stripe[1], index), coordinates(stripe[2], index), stripe[5][index]
     best = np.int64(-1)
     nearest = radius * radius
     for i in range(cell_of(p[0] - radius, cell_m), cell_of(p[0] + radius, cell_m) + 1):
@@ -142,12 +142,12 @@ def _nearest_compatible(heads, following, cell_m, columns, p, stripe, index, rad
             for k in range(cell_of(p[2] - radius, cell_m), cell_of(p[2] + radius, cell_m) + 1):
                 at = np.int64(heads[bucket_of(i, j, k, len(heads))])
                 while at >= 0:
-                    distance = squared_distance(position[at], p)
+                    distance = squared_distance(coordinates(position, at), p)
                     if (
                         distance < nearest
                         and solid[at] == wanted
-                        and normals_agree(normal[at], n, limits[1])
-                        and colours_agree(colour[at], c, limits[2])
+                        and normals_agree(coordinates(normal, at), n, limits[1])
+                        and colours_agree(coordinates(colour, at), c, limits[2])
                     ):
                         best = at
                         nearest = distance

@@ -11,7 +11,7 @@ import numpy as np
 from numba import njit
 
 from vli_common.arrays import Float32Array, FloatArray, IntArray
-from vli_mapping.spatial_hash import SpatialHash, neighbours
+from vli_mapping.spatial_hash import SpatialHash, coordinates, neighbours
 
 MAX_NEIGHBOURS = 192
 MIN_NEIGHBOURS = 6
@@ -65,7 +65,7 @@ def _fit_normals(  # type: ignore[no-untyped-def]
     found = np.empty(MAX_NEIGHBOURS, np.int64)
     plane = np.empty(8)
     for index in which:
-        centre = points[index]
+        centre = coordinates(points, index)
         count = neighbours(heads, following, positions, centre, radius, cell_m, found)
         fit_plane(positions, found[:count], centre, plane)
         planarity[index] = plane[6]

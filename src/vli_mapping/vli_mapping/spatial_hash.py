@@ -61,7 +61,7 @@ def _buckets_for(capacity: int) -> int:
 
 @njit(cache=True, nogil=True)
 def coordinates(positions, index):  # type: ignore[no-untyped-def]
-    """Return x, y, z of one position.
+    """Return x, y, z of one position, or normal, or the three values of a colour.
 
     To numba ``positions[index]`` is an array of its own, whose references are counted by atomic operations: that costs more than
     the visit of a point.
