@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from pathlib import Path
 
@@ -39,8 +40,9 @@ def run(args: argparse.Namespace) -> int:
     merged, registrations = merge_maps((_load(path, allocate) for path in args.maps), allocate=allocate)
     save_map(args.out, merged)
     for path, found in zip(args.maps[1:], registrations, strict=True):
-        shared = f"{100 * found.agreeing:.0f} % of the overlap alike, {1e3 * found.rms_m:.3f} mm RMS point to plane"
-        sys.stdout.write(f"'{path}': {shared}\n")
+        looks = "plain" if math.isnan(found.likeness) else f"alike to {found.likeness:.2f}"
+        shape = f"{100 * found.shape:.0f} % of the overlap of the same shape, {looks}"
+        sys.stdout.write(f"'{path}': {shape}, {1e3 * found.rms_m:.3f} mm RMS point to plane\n")
     sys.stdout.write(f"{len(merged)} points in '{args.out}'\n")
     return 0
 

@@ -39,7 +39,8 @@ def maps(tmp_path: Path) -> Path:
 def test_results_and_files_are_merged(maps: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["merge", str(maps / "scan"), str(maps / "b.vli"), "--out", str(maps / "all.vli")]) == 0
     text = capsys.readouterr().out
-    assert "alike" in text
+    assert f"'{maps / 'b.vli'}': " in text
+    assert "% of the overlap of the same shape, plain, " in text
     merged = load_map(maps / "all.vli")
     assert f"{len(merged)} points in" in text
     assert np.ptp(merged.columns.position[:, 0]) == pytest.approx(0.04, abs=1e-3)

@@ -10,13 +10,13 @@ import pytest
 
 from vli_common.arrays import FloatArray
 from vli_common.errors import InputError
-from vli_common.geometry import pose, so3_exp, transform
+from vli_common.geometry import inverse, pose, so3_exp, transform
 from vli_mapping import merging
 from vli_mapping.allocation import on_disk
 from vli_mapping.light import Light
 from vli_mapping.merging import merge_maps, relit
 from vli_mapping.point_map import PointMap, Stripe
-from vli_mapping.registration import Surface, refine
+from vli_mapping.registration import Surface, likeness, refine
 from vli_mapping.snapshot import Snapshot, restore, take
 
 MOVED = pose(so3_exp(np.array([0.004, -0.006, 0.8])), np.array([0.03, -0.05, 0.002]))
@@ -116,6 +116,57 @@ def test_maps_that_share_nothing_are_refused() -> None:
 def test_maps_that_fit_in_two_ways_are_refused() -> None:
     with pytest.raises(InputError, match="in two ways"):
         merge_maps([scan(-0.03, 0.03, surface=keys), scan(-0.006, 0.018, MOVED, surface=keys, seed=1)])
+
+
+def printed(snapshot: Snapshot, T_map_world: FloatArray = HERE, seed: int = 0, gain: float = 1.0) -> Snapshot:
+    """Return a map whose surface has a print of blots some 1.5 mm wide, no two places of which are alike."""
+    rng = np.random.default_rng(seed)
+    angle, phase = rng.uniform(0, 2 * np.pi, (2, 12, 1))
+    waves = 2 * np.pi / 3e-3 * np.stack([np.cos(angle[:, 0]), np.sin(angle[:, 0])], axis=1)
+    world = transform(inverse(T_map_world), snapshot.columns.position)[:, :2]
+    grey = gain * np.where(np.cos(waves @ world.T + phase).sum(axis=0) > 0, 150.0, 70.0)
+    colour = np.repeat(grey[:, None], 3, axis=1).astype(np.float32)
+    return replace(snapshot, columns=replace(snapshot.columns, colour=colour))
+
+
+@pytest.mark.parametrize("gain", [1.0, 0.5])
+def test_keys_that_repeat_are_told_apart_by_what_is_printed_on_them_however_bright(gain: float) -> None:
+    whole = printed(scan(-0.03, 0.03, surface=keys))
+    part = printed(scan(-0.006, 0.018, MOVED, surface=keys, seed=1), MOVED, gain=gain)
+    _, (found,) = merge_maps([whole, part])
+    assert np.linalg.norm(transform(found.T_target_source @ MOVED, np.zeros((1, 3)))) < 1e-4
+    assert found.likeness > 0.6
+
+
+def test_another_keyboard_with_the_same_keys_is_refused() -> None:
+    whole = printed(scan(-0.03, 0.03, surface=keys))
+    other = printed(scan(-0.006, 0.018, MOVED, surface=keys, seed=1), MOVED, seed=5)
+    with pytest.raises(
+        InputError, match=r"^map '2' does not join .* look alike to '[-0-9.]+' where they have the same shape, expected '0\.43'"
+    ):
+        merge_maps([whole, other])
+
+
+def test_colours_that_vary_less_than_their_noise_tell_nothing() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(0, 0.02, (3000, 3))
+    faint = (100 + 6 * rng.normal(size=(2, 3000, 1)) * np.ones(3)).astype(np.float32)
+    assert np.isnan(likeness(points, *faint))
+    marked = (100 + 30 * rng.choice([-1, 1], (2, 3000, 1)) * np.ones(3)).astype(np.float32)
+    assert abs(likeness(points, *marked)) < 0.1
+    assert likeness(points, marked[0], marked[0] + faint[0] - 100) > 0.9
+    unknown = np.full((3000, 3), np.nan, np.float32)
+    assert np.isnan(likeness(points, marked[0], unknown))
+
+
+def test_a_gradient_over_the_whole_overlap_is_no_likeness() -> None:
+    """Two faces that fall off into the dark look alike at large, and nowhere close by."""
+    rng = np.random.default_rng(1)
+    points = rng.uniform(0, 0.04, (6000, 3)) * [1, 1, 0]
+    ramp = 4000 * points[:, :1]
+    one, other = ((60 + ramp + 15 * rng.normal(size=(6000, 1))) * np.ones(3) for _ in range(2))
+    assert np.corrcoef(one[:, 0], other[:, 0])[0, 1] > 0.85
+    assert likeness(points, one.astype(np.float32), other.astype(np.float32)) < 0.43
 
 
 def test_directions_that_no_plane_tells_of_stay() -> None:
