@@ -41,6 +41,7 @@ from vli_bringup.processes import GraphError
 from vli_bringup.tum import read_tum
 from vli_common.arrays import FloatArray
 from vli_common.node.shared_memory import remove_dead_segments
+from vli_common.stop_signals import held_back
 
 DATA = Path(__file__).resolve().parents[3] / "shared/data/keyboard_short"
 RATES = (1.0, 1.25, 1.5, 1.75, 2.0, 2.5, 3.0)
@@ -220,7 +221,9 @@ def _start_and_stop(recording: Recording, sign: signal.Signals, after_s: float) 
     """Return exit code, standard error and seconds to the end of each node."""
     arguments = ["--ros-args", "-p", f"calibration_file:={recording.calibration_path}"]
     commands = [[sys.executable, "-m", node.module, *arguments] for node in describe_graph(recording.calibration_path)]
-    processes = [subprocess.Popen(command, stderr=subprocess.PIPE) for command in commands]
+    # As `vli` does: a signal waits until a node has its handlers.
+    with held_back():
+        processes = [subprocess.Popen(command, stderr=subprocess.PIPE) for command in commands]
     time.sleep(after_s)
     begin_s = time.monotonic()
     for process in processes:

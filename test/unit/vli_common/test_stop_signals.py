@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -12,11 +13,14 @@ import pytest
 from vli_common.stop_signals import held_back
 
 _MODULE = """
-import os, signal
+import os, signal, sys
 import vli_common.stop_signals as stop_signals
-for number in (signal.SIGINT, signal.SIGTERM):
-    os.kill(os.getpid(), number)
+number = signal.Signals[os.environ["SENT"]]
+if "TAKEN" in os.environ:
+    stop_signals.take_over()
+os.kill(os.getpid(), number)
 print(stop_signals.STOP.is_set())
+sys.exit(7)
 """
 
 
@@ -30,32 +34,38 @@ def package(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def run(directory: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, *arguments], cwd=directory, capture_output=True, text=True, check=False)
-
-
-def test_a_node_that_is_being_loaded_notes_the_signal_and_goes_on(package: Path) -> None:
+def run(directory: Path, *arguments: str, **environment: str) -> tuple[int, str, str]:
     done = subprocess.run(
-        [sys.executable, "-m", "robot.nodes.some_node"], cwd=package, capture_output=True, text=True, check=False
+        [sys.executable, *arguments], cwd=directory, env=os.environ | environment, capture_output=True, text=True, check=False
     )
-    assert (done.returncode, done.stdout, done.stderr) == (0, "True\n", "")
+    return done.returncode, done.stdout, done.stderr
+
+
+@pytest.mark.parametrize("sent", ["SIGINT", "SIGTERM"])
+def test_a_node_that_is_being_loaded_ends_at_once_and_in_silence(package: Path, sent: str) -> None:
+    assert run(package, "-m", "robot.nodes.some_node", SENT=sent) == (0, "", "")
+
+
+@pytest.mark.parametrize("sent", ["SIGINT", "SIGTERM"])
+def test_a_node_that_runs_notes_the_signal_and_goes_on(package: Path, sent: str) -> None:
+    assert run(package, "-m", "robot.nodes.some_node", SENT=sent, TAKEN="yes") == (7, "True\n", "")
 
 
 def test_a_process_that_only_imports_a_node_keeps_its_signals(package: Path) -> None:
-    done = run(package, "-c", "import robot.nodes.some_node")
-    assert done.returncode == -signal.SIGINT
+    code, _, _ = run(package, "-c", "import robot.nodes.some_node", SENT="SIGINT")
+    assert code == -signal.SIGINT
 
 
 def test_a_signal_that_comes_before_python_is_there_waits_for_the_handler(package: Path) -> None:
     (package / "robot" / "nodes" / "waiting_node.py").write_text(
-        "from vli_common.stop_signals import STOP\nprint(STOP.wait(60))\n"
+        "from vli_common.stop_signals import STOP\nprint(STOP.wait(60))\nraise SystemExit(7)\n"
     )
     with held_back():
         process = subprocess.Popen(
             [sys.executable, "-m", "robot.nodes.waiting_node"], cwd=package, stdout=subprocess.PIPE, stderr=subprocess.PIPE
         )
     process.send_signal(signal.SIGTERM)
-    assert process.communicate() == (b"True\n", b"")
+    assert process.communicate() == (b"", b"")
     assert process.returncode == 0
 
 
