@@ -28,6 +28,7 @@ from vli_common.calibration import load_calibration
 from vli_common.types import Image, LaserScan
 from vli_mapping.albedo import albedo
 from vli_mapping.light import Light
+from vli_mapping.photographs import develop
 from vli_mapping.point_map import PointMap
 from vli_mapping.warm_up import warm_up
 
@@ -128,6 +129,7 @@ def report(data: Path) -> None:
     for start, end in spans:
         timed = time_with_truth(data, calibration, ERROR_M, frames=[item for item in frames if start <= item.stamp_ns <= end])
         timed.mapper.settle()
+        develop(timed.mapper.map, light, calibration.camera, timed.mapper.photographs())
         maps.append(timed.mapper.map)
     first, second = passes = (Pass.of(maps[0], light, data), Pass.of(maps[1], light, data))
     distance, nearest = KDTree(first.position).query(second.position)

@@ -69,7 +69,8 @@ class Sessions:
 
 
 def write_map(directory: Path, mapper: Mapper) -> PointCloud:
-    """Write the map as a cloud, and whole; return the cloud."""
+    """Write the map of a scan that is at its end as a cloud, and whole; return the cloud."""
+    mapper.develop()
     cloud = mapper.cloud()
     write_ply(directory / "map.ply", cloud)
     save_map(directory / f"map{SUFFIX}", take(mapper.map, mapper.light()))

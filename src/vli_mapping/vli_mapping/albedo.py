@@ -18,7 +18,7 @@ from vli_common.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from vli_common.types import PointCloud
 from vli_mapping.light import Light
 from vli_mapping.normals import MAX_NEIGHBOURS
-from vli_mapping.point_map import PointMap, to_bytes
+from vli_mapping.point_map import Columns, PointMap, to_bytes
 from vli_mapping.ray_casting import cast, direct
 from vli_mapping.spatial_hash import SpatialHash, neighbours
 
@@ -28,8 +28,10 @@ _SPARSE = 3
 """One in so many points is a neighbour: those along a stripe say the same."""
 _SAME_FACE = float(np.cos(np.radians(40.0)))
 """Cosine between normals of one face: nearer than the flank of a key is to its top."""
-_TILTED, _CURVED = 0.05, 1.0
-"""Doubt per unit of tan² of an incidence, and of the tan² that the scatter of the normals around comes to."""
+_UNLIT, _ENOUGH, _MISFIT, _CURVED = 0.4, 3.0, 200.0, 1.0
+"""Doubt of a point that has been in the light of the reference once less than in enough of it; of one whose views have nothing in
+common; and per unit of the tan² that the scatter of the normals around comes to."""
+_LEAST_WEIGHT = 1e-3
 _ROUGH, _SHADOWED = 4.0, 10.0
 """Doubt of a point that has no normal of its own or may fly, and of one that the light does not reach."""
 _LEAST = 0.02
@@ -66,20 +68,48 @@ def albedo(point_map: PointMap, light: Light) -> Float32Array:
         light: of the scan that made it.
     """
     c, which = point_map.columns, point_map.alive()
-    around = _Neighbourhood(c.position[which], _REACH * point_map.config.normal_radius)
+    around = _neighbourhood(point_map, which)
     normals, agreement = around.mean_normals(c.normal[which])
     shading, dark = np.empty(len(which)), np.empty(len(which), np.bool_)
     for start in range(0, len(which), _CHUNK):
         part = slice(start, start + _CHUNK)
         shading[part], dark[part] = light_on(point_map, light, which[part], normals[part])
+    colours, weight, misfit = _by_all_views(c.at(which), shading)
     doubt = (
-        _TILTED * (1.0 / np.minimum(shading, 1.0) ** 2 - 1.0)
+        _UNLIT * np.maximum(1.0 / weight - 1.0 / _ENOUGH, 0.0)
+        + _MISFIT * misfit
         + _CURVED * (1.0 / agreement**2 - 1.0)
         + _ROUGH * ~c.normal[which].any(axis=1)
         + _ROUGH * ~c.solid[which]
         + _SHADOWED * dark
     )
-    return around.blend((c.colour[which] / shading[:, None]).astype(np.float32), doubt)
+    return around.blend(colours, doubt)
+
+
+def mean_normals(point_map: PointMap, which: IntArray) -> Float32Array:
+    """Return the normals (K, 3) of the faces that rows ``which`` of a map are on, 0 where none is known."""
+    return _neighbourhood(point_map, which).mean_normals(point_map.columns.normal[which])[0]
+
+
+def _by_all_views(points: Columns, shading: FloatArray) -> tuple[Float32Array, FloatArray, FloatArray]:
+    """Return what the views of the colours, of a ``shading`` (K,), and all photographs say together, see ``photographs``.
+
+    Returns:
+        Albedo (K, 3), Σ E² (K,), and how badly they agree (K,), 0 … 1.
+    """
+    seen = ~np.isnan(points.colour[:, 0])
+    colour, shading = np.where(seen[:, None], points.colour, 0.0), np.where(seen, shading, 0.0)
+    weight = points.albedo_weight + shading**2
+    total = points.albedo * points.albedo_weight[:, None] + colour * shading[:, None]
+    power = points.albedo_power + colour.mean(axis=1) ** 2
+    with np.errstate(invalid="ignore", divide="ignore"):
+        colours = (total / weight[:, None]).astype(np.float32)
+        misfit = np.nan_to_num(1.0 - total.mean(axis=1) ** 2 / (weight * power), posinf=0.0, neginf=0.0)
+    return colours, np.maximum(weight, _LEAST_WEIGHT), np.maximum(misfit, 0.0)
+
+
+def _neighbourhood(point_map: PointMap, which: IntArray) -> _Neighbourhood:
+    return _Neighbourhood(point_map.columns.position[which], _REACH * point_map.config.normal_radius)
 
 
 def light_on(point_map: PointMap, light: Light, which: IntArray, normals: Float32Array) -> tuple[FloatArray, BoolArray]:

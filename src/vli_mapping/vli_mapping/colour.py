@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numba import njit
 
-from vli_common.arrays import ByteArray, Float32Array, FloatArray
+from vli_common.arrays import BoolArray, ByteArray, Float32Array, FloatArray
 from vli_common.camera import CameraModel
 from vli_common.geometry import inverse, transform
 from vli_mapping.light import Sightings
@@ -50,6 +50,21 @@ def colour_points(
     with np.errstate(invalid="ignore"):
         result: Float32Array = total / weight[:, None]
     return result
+
+
+def sample_colours(camera: CameraModel, local: FloatArray, pixels: ByteArray) -> tuple[Float32Array, BoolArray]:
+    """Return RGB (N, 3), 0 … 255, of points (N, 3) in the camera frame, and which of them (N,) an image shows, well exposed.
+
+    Args:
+        camera: of the image.
+        local: all of the surface in its view, any of which may be in front of any other.
+        pixels: (H, W, 3) BGR or (H, W) grey.
+    """
+    where, hidden = camera.project(local), np.empty(len(local), np.bool_)
+    _mark_hidden(where, local, _HIDING_M, hidden)
+    total, weight = np.zeros((len(local), 3), np.float32), np.zeros(len(local), np.float32)
+    _add_samples(pixels if pixels.ndim == 3 else pixels[:, :, None], where, hidden, total, weight)
+    return total, weight == 1.0
 
 
 def sight(

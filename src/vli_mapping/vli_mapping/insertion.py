@@ -55,7 +55,9 @@ def insert_stripe(  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _add(heads, following, cell_m, state, columns, stripe, index, number, stamp_ns):  # type: ignore[no-untyped-def]
     """Write a point into a row that is free, else into a new one; return the row."""
-    position, normal, colour, weight, sigma, planarity, scan, seen_by, entered_ns, solid = columns
+    position, normal, colour, weight, sigma, planarity, scan, seen_by, entered_ns, solid, albedo, albedo_weight, albedo_power = (
+        columns
+    )
     points, normals, colours, sigmas, planarities, stripe_solid = stripe
     at = state[FREE_HEAD]
     if at >= 0:
@@ -74,6 +76,9 @@ def _add(heads, following, cell_m, state, columns, stripe, index, number, stamp_
     seen_by[at] = number
     entered_ns[at] = stamp_ns
     solid[at] = stripe_solid[index]
+    albedo[at] = 0.0
+    albedo_weight[at] = 0.0
+    albedo_power[at] = 0.0
     link_one(heads, following, at, position[at], cell_m)
     return at
 

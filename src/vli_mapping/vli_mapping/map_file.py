@@ -30,14 +30,16 @@ from vli_mapping.point_map import Columns
 from vli_mapping.snapshot import Snapshot
 from vli_mapping.store import replacing
 
-FORMAT, VERSION = "vli-map", 2
-_WITHOUT_KEYFRAMES = 1
-"""The version before, which is read as well."""
+FORMAT, VERSION = "vli-map", 3
+_WITHOUT_KEYFRAMES, _WITHOUT_ALBEDO = 1, 2
+"""The versions before, which are read as well."""
 SUFFIX = ".vli"
 _HEADER = "header.json"
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 """Of every entry: the same map is the same file."""
 _VIEWS = "views"
+_ALBEDO = {"albedo": (3,), "albedo_weight": (), "albedo_power": ()}
+"""What version 3 brought."""
 _MAX_HEADER_BYTES = 1 << 16
 _CHUNK_BYTES, _CHUNK_ROWS = 1 << 20, 1 << 18
 """Read, and looked at, at a time."""
@@ -83,8 +85,11 @@ def load_map(path: Path, allocate: Allocate = in_memory) -> Snapshot:
     """
     with _reading(path) as archive:
         header = _read_header(path, archive)
-        columns = {name: _read_array(archive, name, allocate) for name in (*_names(), _VIEWS)}
-        has_keyframes = header["version"] != _WITHOUT_KEYFRAMES
+        version = header["version"]
+        columns = {name: _read_array(archive, name, allocate) for name in (*_names(version), _VIEWS)}
+        if version <= _WITHOUT_ALBEDO:
+            columns |= _no_albedo(len(columns["weight"]), allocate)
+        has_keyframes = version > _WITHOUT_KEYFRAMES
         keyframes = unpack({name: _read_array(archive, name) for name in KEYFRAME_ARRAYS}) if has_keyframes else ()
         light = None if header["light"] is None else _light_from_json(header["light"])
         return replace(_checked(path, header, columns, light), keyframes=keyframes)
@@ -126,8 +131,16 @@ def _reading(path: Path) -> Iterator[zipfile.ZipFile]:
         raise InputError(f"map '{path}' is damaged ({error}); save it again") from error
 
 
-def _names() -> tuple[str, ...]:
-    return tuple(item.name for item in fields(Columns))
+def _names(version: int = VERSION) -> tuple[str, ...]:
+    return tuple(item.name for item in fields(Columns) if version > _WITHOUT_ALBEDO or item.name not in _ALBEDO)
+
+
+def _no_albedo(count: int, allocate: Allocate) -> dict[str, AnyArray]:
+    """Return the columns that a map of an earlier version lacks."""
+    columns: dict[str, AnyArray] = {name: allocate((count, *shape), np.float32) for name, shape in _ALBEDO.items()}
+    for column in columns.values():
+        column[:] = 0
+    return columns
 
 
 def _arrays(snapshot: Snapshot) -> Iterator[tuple[str, AnyArray]]:
@@ -145,10 +158,10 @@ def _read_header(path: Path, archive: zipfile.ZipFile) -> dict[str, Any]:
     header = json.loads(archive.read(info))
     if not isinstance(header, dict) or header.get("format") != FORMAT:
         raise InputError(f"'{path}' is no map: its header does not say '{FORMAT}'")
-    if header.get("version") not in (_WITHOUT_KEYFRAMES, VERSION):
+    if header.get("version") not in range(_WITHOUT_KEYFRAMES, VERSION + 1):
         raise InputError(
             f"map '{path}' has version '{str(header.get('version'))[:20]}', this program reads "
-            f"'{_WITHOUT_KEYFRAMES}' and '{VERSION}'; scan again or update"
+            f"'{_WITHOUT_KEYFRAMES}' to '{VERSION}'; scan again or update"
         )
     return header
 
@@ -214,8 +227,10 @@ def _are_sound(columns: Columns) -> bool:
     shaped = (np.abs(columns.normal) <= _UNIT).all() and not np.isinf(columns.planarity).any()
     # Colours may be NaN: of points that no long image saw.
     coloured = not np.isinf(columns.colour).any()
+    sums = np.stack([columns.albedo_weight, columns.albedo_power])
+    developed = np.isfinite(columns.albedo).all() and np.isfinite(sums).all() and (sums >= 0).all()
     weighed = (columns.weight > 0).all() and np.isfinite(columns.weight).all() and np.isfinite(columns.sigma).all()
-    return bool(sized and shaped and coloured and weighed and columns.solid.view(np.uint8).max(initial=0) <= 1)
+    return bool(sized and shaped and coloured and developed and weighed and columns.solid.view(np.uint8).max(initial=0) <= 1)
 
 
 def _light_to_json(light: Light) -> dict[str, Any]:

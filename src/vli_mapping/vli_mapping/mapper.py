@@ -17,6 +17,7 @@ from vli_mapping.contradiction import contradict
 from vli_mapping.light import Light, LightEstimator
 from vli_mapping.map_file import load_map
 from vli_mapping.map_keyframes import KeyframeIntake
+from vli_mapping.photographs import Album, Photograph, develop
 from vli_mapping.point_map import PointMap, Stripe, to_bytes
 from vli_mapping.scan_window import PosedScan, ScanWindow
 from vli_mapping.scene_change import SceneChange
@@ -52,8 +53,8 @@ class Mapper:
         self._entering: deque[PosedScan] = deque()
         self._touched: list[IntArray] = []
         self._entered_ns = 0
-        self._intake = KeyframeIntake(calibration.camera)
-        self._camera, self._is_levelled = calibration.camera, mode.uses_imu
+        self._intake, self._album = KeyframeIntake(calibration.camera), Album()
+        self.camera, self._is_levelled = calibration.camera, mode.uses_imu
         self._whereabouts = self._new_whereabouts()
         self._prior = load_map(Path(self.config.prior_map)) if self.config.prior_map else None
         if self._prior is not None:
@@ -131,6 +132,16 @@ class Mapper:
         """Return the light on board and the lens as all scans so far tell of them; None while they tell too little."""
         return self._light.fit()
 
+    def photographs(self) -> tuple[Photograph, ...]:
+        """Return the images that the map does not have the albedo of yet."""
+        return tuple(self._album.photographs)
+
+    def develop(self) -> None:
+        """Let the map have what the photographs say of albedo, and forget these: once, when a scan is at its end."""
+        self.settle()
+        develop(self.map, self.light(), self.camera, self._album.photographs)
+        self._album.clear()
+
     def settle(self) -> None:
         """Enter all scans that have left the window."""
         while self._entering:
@@ -171,6 +182,7 @@ class Mapper:
         self._unrefined.clear()
         self._change.clear()
         self._intake.clear()
+        self._album.clear()
         self._light = LightEstimator()
         self._window = self._window.successor(session)
         self._whereabouts.drop_held()
@@ -179,7 +191,7 @@ class Mapper:
             self.adopt(self._prior)
 
     def _new_whereabouts(self) -> Whereabouts:
-        return Whereabouts(self._camera, self._is_levelled, self.counters)
+        return Whereabouts(self.camera, self._is_levelled, self.counters)
 
     def _replace(self, snapshot: Snapshot) -> None:
         """Take another map in place of this one; scans are numbered on from those that made it."""
@@ -190,6 +202,7 @@ class Mapper:
         self._unrefined.clear()
         self._change.clear()
         self._intake.clear()
+        self._album.clear()
         self._window.count_from(len(snapshot.views))
 
     def _let_go(self, window: WindowPoses) -> None:
@@ -206,6 +219,7 @@ class Mapper:
             for image, row in self._window.keyframe_images(window):
                 if window.final[row]:
                     self._intake.offer(image, window.T_map_camera[row], depth, self.map)
+                    self._album.offer(image, window.T_map_camera[row], depth)
 
     def _enter_next(self) -> None:
         """Enter the oldest scan that waits, if one does."""

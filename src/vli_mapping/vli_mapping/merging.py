@@ -90,6 +90,7 @@ def _enter(whole: PointMap, scan: Columns, views: FloatArray, T_whole_snapshot: 
         )
     )
     whole.add_weight(target, scan.weight - 1)
+    whole.add_albedo(target, scan)
 
 
 def relit(snapshot: Snapshot, light: Light | None) -> Snapshot:

@@ -38,6 +38,9 @@ class Columns:
         seen_by: (N,) int32, number of the scan whose long images gave the colour: of several visits that with the best view.
         entered_ns: (N,) int64, its stamp.
         solid: (N,) bool, False for a point that stays only until something better covers its place.
+        albedo: (N, 3) float32, RGB under the reference light as photographs have shown it, see ``photographs``.
+        albedo_weight: (N,) float32, of it, Σ E²; 0 where none has.
+        albedo_power: (N,) float32, Σ of the squared grey levels that it is of.
     """
 
     position: FloatArray
@@ -50,6 +53,9 @@ class Columns:
     seen_by: Int32Array
     entered_ns: IntArray
     solid: BoolArray
+    albedo: Float32Array
+    albedo_weight: Float32Array
+    albedo_power: Float32Array
 
     @staticmethod
     def empty(capacity: int, allocate: Allocate = in_memory) -> Columns:
@@ -66,6 +72,9 @@ class Columns:
             allocate((capacity,), np.int32),
             allocate((capacity,), np.int64),
             allocate((capacity,), np.bool_),
+            allocate((capacity, 3), narrow),
+            allocate((capacity,), narrow),
+            allocate((capacity,), narrow),
         )
 
     def grow(self, capacity: int, count: int, allocate: Allocate = in_memory) -> None:
@@ -170,7 +179,7 @@ class PointMap:
             self.grid.next,
             CELL_M,
             self._state,
-            (c.position, c.normal, c.colour, c.weight, c.sigma, c.planarity, c.scan, c.seen_by, c.entered_ns, c.solid),
+            tuple(getattr(c, item.name) for item in fields(c)),
             self.views,
             (stripe.points, stripe.normals, stripe.colours, stripe.sigma, stripe.planarity, stripe.solid),
             stripe.number,
@@ -186,6 +195,18 @@ class PointMap:
         weight = self.columns.weight
         np.add.at(weight, target[there], more[there])
         np.minimum(weight, np.float32(self.config.max_weight), out=weight, where=weight > 0)
+
+    def add_albedo(self, target: IntArray, others: Columns) -> None:
+        """Let points know the albedo of ``others`` (N rows) as well; ``target`` (N,) is what ``insert`` said of these."""
+        c, told = self.columns, (target >= 0) & (others.albedo_weight > 0)
+        rows, which = np.unique(target[told], return_inverse=True)
+        weight = others.albedo_weight[told]
+        total = np.column_stack([np.bincount(which, weight * column) for column in others.albedo[told].T])
+        old = c.albedo_weight[rows, None]
+        new = old + np.bincount(which, weight)[:, None]
+        c.albedo[rows] = (old * c.albedo[rows] + total) / new
+        c.albedo_weight[rows] = new[:, 0]
+        c.albedo_power[rows] += np.bincount(which, others.albedo_power[told])
 
     def halve(self, which: IntArray) -> int:
         """Halve the weight of rows ``which`` (K,), each once; doubtful ones, and those with one or less, leave; say how many."""

@@ -15,6 +15,7 @@ from vli_mapping.entry import away_from_edges, facing, noisy, supported
 from vli_mapping.light import Light
 from vli_mapping.map_keyframes import meet
 from vli_mapping.normals import smooth_normals, stripe_normals
+from vli_mapping.photographs import Photograph, develop
 from vli_mapping.point_map import PointMap, Stripe
 from vli_mapping.scan_window import PosedScan
 from vli_mapping.spatial_hash import SpatialHash
@@ -38,7 +39,8 @@ def warm_up() -> None:
     c = point_map.columns
     SpatialHash.of(points, limits.normal_radius).reserve(1 << 12, points, np.ones(64, np.bool_))
     smooth_normals(point_map.grid, c.position, c.normal, point_map.alive(), limits.normal_radius)
-    albedo(point_map, Light(np.zeros(3), 0.0, (0.0, 0.0), 0.03))
+    light = Light(np.zeros(3), 0.0, (0.0, 0.0), 0.03)
+    albedo(point_map, light)
     scan = LaserScan(0, points, points[:, :2], sigma, sigma)
     every, normals, planarity = np.ones(64, np.bool_), np.zeros((64, 3), np.float32), np.zeros(64, np.float32)
     posed = PosedScan(scan, 1000, np.eye(4), np.zeros((64, 3), np.float32), every, every, normals, planarity)
@@ -47,4 +49,6 @@ def warm_up() -> None:
     thin(point_map.columns.position[: point_map.rows], point_map.columns.weight[: point_map.rows], 8)
     camera = make_camera("none", (100.0, 100.0, 8.0, 8.0), (), (16, 16))
     for shape in ((16, 16, 3), (16, 16)):
-        colour_points(camera, points, [(np.zeros(shape, np.uint8), np.eye(4))])
+        pixels = np.zeros(shape, np.uint8)
+        colour_points(camera, points, [(pixels, np.eye(4))])
+        develop(point_map, light, camera, [Photograph.of(pixels, np.eye(4), 0.03)])

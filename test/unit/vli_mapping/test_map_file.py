@@ -31,6 +31,8 @@ def snapshot() -> Snapshot:
     sheet(point_map, rows=20)
     point_map.refine_normals(point_map.alive(), np.array([0, 0, 1.0]))
     point_map.keyframes.extend(keyframe(seed) for seed in range(3))
+    c, told = point_map.columns, slice(0, point_map.rows, 2)
+    c.albedo[told], c.albedo_weight[told], c.albedo_power[told] = [90.0, 120.0, 60.0], 2.0, 9000.0
     return take(point_map, LIGHT)
 
 
@@ -62,11 +64,18 @@ def test_a_map_is_loaded_as_it_was_saved(snapshot: Snapshot, tmp_path: Path) -> 
     assert [path.name for path in tmp_path.iterdir()] == ["map.vli"]
 
 
-def test_a_map_of_the_version_before_has_no_keyframes(snapshot: Snapshot, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("version", "lacking"), [(1, ("albedo", "keyframe")), (2, ("albedo",))])
+def test_a_map_of_a_version_before_lacks_what_came_later(
+    snapshot: Snapshot, tmp_path: Path, version: int, lacking: tuple[str, ...]
+) -> None:
     save_map(tmp_path / "map.vli", snapshot)
-    rewrite(tmp_path / "map.vli", lambda name, data: None if "keyframe" in name else header(version=1)(name, data))
+    change = header(version=version)
+    rewrite(tmp_path / "map.vli", lambda name, data: None if name.startswith(lacking) else change(name, data))
     back = load_map(tmp_path / "map.vli")
-    assert_same(back, replace(snapshot, keyframes=()))
+    for name in ("albedo", "albedo_weight", "albedo_power"):
+        assert not getattr(back.columns, name).any()
+        getattr(snapshot.columns, name)[:] = 0
+    assert_same(back, replace(snapshot, keyframes=() if version == 1 else snapshot.keyframes))
 
 
 def test_the_same_map_is_the_same_file(snapshot: Snapshot, tmp_path: Path) -> None:
@@ -179,9 +188,11 @@ def compress(path: Path) -> None:
         (lambda path: path.write_bytes(path.read_bytes()[:-1000]), "no map or a damaged one"),
         (lambda path: rewrite(path, lambda name, data: None if name == "header.json" else data), "no 'header.json'"),
         (lambda path: rewrite(path, header(format="other")), "does not say 'vli-map'"),
-        (lambda path: rewrite(path, header(version=99)), "version '99', this program reads '1' and '2'"),
+        (lambda path: rewrite(path, header(version=99)), "version '99', this program reads '1' to '3'"),
         (lambda path: rewrite(path, header(points=7)), "do not belong together"),
         (lambda path: rewrite(path, lambda name, data: None if "descriptors" in name else data), "damaged.*descriptors"),
+        (lambda path: rewrite(path, column("albedo_weight", lambda values: -values)), "damaged.*nowhere, or look like nothing"),
+        (lambda path: rewrite(path, column("albedo", lambda values: np.full_like(values, np.inf))), "damaged.*nowhere, or look like nothing"),
         (lambda path: rewrite(path, column("keyframe_poses", lambda values: 2 * values)), "damaged.*keyframes are nowhere"),
         (lambda path: rewrite(path, column("keyframe_points", lambda values: np.nan * values)), "damaged.*keyframes are nowhere"),
         (lambda path: rewrite(path, column("keyframe_depths", lambda values: -values)), "damaged.*keyframes are nowhere"),
