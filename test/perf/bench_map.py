@@ -180,7 +180,7 @@ def print_scaling(sizes: list[float]) -> None:
         for number, row in enumerate(rng.integers(0, rows, 300).tolist()):
             stripe = sheet_stripe(row, POINTS, int(rng.integers(0, SHEET - POINTS)), rows + number, rng)
             start = time.perf_counter()
-            trusted, _ = contradict(point_map, stripe)
+            trusted, *_ = contradict(point_map, stripe)
             target = point_map.insert(trusted)
             point_map.refine_normals(np.unique(target[target >= 0]), stripe.viewpoint)
             spent.append(1e3 * (time.perf_counter() - start))

@@ -73,6 +73,12 @@ class MapConfig:
         maximum=1.0e6,
         doc="weight of the map in the way of a view from which on its end is doubted; smaller: fewer ghosts below",
     )
+    piece_share: float = parameter(
+        0.02,
+        minimum=1.0e-3,
+        maximum=1.0,
+        doc="share of a piece of stripe that views contradict from which on the rest leaves too; smaller: fewer ghosts; 1: off",
+    )
     min_planarity: float = parameter(
         0.75, minimum=0.0, maximum=1.0, doc="flatness below which a point has no normal rather than a wrong one"
     )

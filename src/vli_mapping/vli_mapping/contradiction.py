@@ -27,16 +27,17 @@ _MIN_FACING = 0.3
 _MOST_ROWS = 4096
 
 
-def contradict(point_map: PointMap, stripe: Stripe) -> tuple[Stripe, int]:
+def contradict(point_map: PointMap, stripe: Stripe) -> tuple[Stripe, int, int]:
     """Halve the weight of the points that a stripe, which has not entered yet, contradicts; those with no more than one leave.
 
     Returns:
-        The stripe, its points that the map would hide no longer solid, and how many points left.
+        The stripe, its points that the map would hide no longer solid; how many points left, and how many more with them,
+        see :mod:`vli_mapping.pieces`.
     """
     c, config = point_map.columns, point_map.config
     if not config.ray_radius or not len(point_map):
-        return stripe, 0
-    hidden, rows = np.zeros(len(stripe), np.bool_), np.empty(_MOST_ROWS, np.int64)
+        return stripe, 0, 0
+    hidden, rows, by = np.zeros(len(stripe), np.bool_), np.empty(_MOST_ROWS, np.int64), np.empty(_MOST_ROWS, np.int64)
     count = _cast_stripe(
         (point_map.grid.heads, point_map.grid.next, point_map.grid.cell_m),
         (c.position, c.normal, c.weight, c.solid),
@@ -45,13 +46,16 @@ def contradict(point_map: PointMap, stripe: Stripe) -> tuple[Stripe, int]:
         (stripe.points, stripe.sigma, stripe.solid),
         (config.ray_radius, config.ray_margin, config.hiding_weight),
         rows,
+        by,
         hidden,
     )
-    return replace(stripe, solid=stripe.solid & ~hidden), point_map.halve(np.unique(rows[:count]))
+    left = point_map.halve(np.unique(rows[:count]))
+    more = point_map.remove_with(rows[:count], stripe.points[by[:count]], stripe.number)
+    return replace(stripe, solid=stripe.solid & ~hidden), left, more
 
 
 @njit(cache=True, nogil=True)
-def _cast_stripe(grid, columns, seen, eye, stripe, limits, rows, hidden):  # type: ignore[no-untyped-def]
+def _cast_stripe(grid, columns, seen, eye, stripe, limits, rows, by, hidden):  # type: ignore[no-untyped-def]
     """Write the rows that a stripe contradicts, some of them several times, into ``rows``; return how many.
 
     Args:
@@ -62,6 +66,7 @@ def _cast_stripe(grid, columns, seen, eye, stripe, limits, rows, hidden):  # typ
         stripe: points, sigma and solid.
         limits: radius about a ray, margin at its end, weight in the way of a ray that hides its end.
         rows: the answer.
+        by: which point of the stripe contradicts each of them.
         hidden: (N,), gets True for points of the stripe that the map would hide.
     """
     points, sigma, solid = stripe
@@ -75,6 +80,7 @@ def _cast_stripe(grid, columns, seen, eye, stripe, limits, rows, hidden):  # typ
             continue
         length = direct(eye, points[index], ray)
         gap = margin + _NOISE_SIGMAS * sigma[index]
+        first = count
         count, in_the_way = cast(grid, columns, eye, ray, length - _REACH_M, length - gap, radius, _MIN_FACING, rows, count)
         hidden[index : index + _STRIDE] |= in_the_way >= hides
         found, _ = cast(grid, columns, eye, ray, length + gap, length + _REACH_M, 2 * radius, _MIN_FACING, behind, 0)
@@ -85,4 +91,5 @@ def _cast_stripe(grid, columns, seen, eye, stripe, limits, rows, hidden):  # typ
             if in_the_way >= hides and count < len(rows):
                 rows[count] = at
                 count += 1
+        by[first:count] = index
     return count

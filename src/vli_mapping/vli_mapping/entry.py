@@ -61,7 +61,7 @@ def _trim_edges(points, sigma, edge_jump, slope, trim, min_segment, keep):  # ty
     count = len(points)
     start = 0
     for stop in range(1, count + 1):
-        if stop < count and not _jumps(points[stop - 1], points[stop], sigma[stop - 1] + sigma[stop], edge_jump, slope):
+        if stop < count and not jumps(points[stop - 1], points[stop], sigma[stop - 1] + sigma[stop], edge_jump, slope):
             continue
         if stop - start < min_segment:
             keep[start:stop] = False
@@ -74,7 +74,7 @@ def _trim_edges(points, sigma, edge_jump, slope, trim, min_segment, keep):  # ty
 
 
 @njit(cache=True, nogil=True)
-def _jumps(a, b, sigma, edge_jump, slope):  # type: ignore[no-untyped-def]
+def jumps(a, b, sigma, edge_jump, slope):  # type: ignore[no-untyped-def]
     """Return True where the step from a to b is farther along the ray than a surface at the largest incidence would go."""
     length = np.sqrt(a[0] ** 2 + a[1] ** 2 + a[2] ** 2)
     along = ((b[0] - a[0]) * a[0] + (b[1] - a[1]) * a[1] + (b[2] - a[2]) * a[2]) / length

@@ -108,7 +108,7 @@ def _drop_doubtful(heads, following, cell_m, state, columns, p, radius):  # type
                 while at >= 0:
                     after = following[at]
                     if not solid[at] and squared_distance(position[at], p) <= radius * radius:
-                        _remove_one(heads, following, cell_m, state, position, weight, at)
+                        remove_one(heads, following, cell_m, state, position, weight, at)
                     at = after
 
 
@@ -116,11 +116,11 @@ def _drop_doubtful(heads, following, cell_m, state, columns, p, radius):  # type
 def remove(heads, following, cell_m, state, position, weight, which):  # type: ignore[no-untyped-def]
     """Let the points of rows ``which`` (K,) leave."""
     for at in which:
-        _remove_one(heads, following, cell_m, state, position, weight, at)
+        remove_one(heads, following, cell_m, state, position, weight, at)
 
 
 @njit(cache=True, nogil=True)
-def _remove_one(heads, following, cell_m, state, position, weight, at):  # type: ignore[no-untyped-def]
+def remove_one(heads, following, cell_m, state, position, weight, at):  # type: ignore[no-untyped-def]
     """Take a point out of its chain; its row is the next that is used again."""
     unlink_one(heads, following, at, position[at], cell_m)
     weight[at] = 0.0

@@ -235,7 +235,7 @@ class Mapper:
     def _enter(self, item: PosedScan) -> IntArray:
         """Merge one scan into the map; return the map points (K,) it touched."""
         seen = _stripe(item)
-        stripe, left = contradict(self.map, seen)
+        stripe, left, with_them = contradict(self.map, seen)
         self._change.add(seen.solid, seen.solid & ~stripe.solid)
         target = self.map.insert(stripe)
         touched = np.unique(target[target >= 0])
@@ -243,6 +243,7 @@ class Mapper:
         self.counters.add("scans_entered")
         self.counters.add("points_entered", int((target >= 0).sum()))
         self.counters.add("points_contradicted", left)
+        self.counters.add("points_left_with_piece", with_them)
         self.counters.add("points_blurred", int((~item.usable).sum()))
         self.counters.add("points_doubtful_dropped", int((target < 0).sum()))
         self._refine(touched, item.viewpoint)

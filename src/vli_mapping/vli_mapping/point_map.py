@@ -14,6 +14,7 @@ from vli_mapping.insertion import FREE, ROWS, insert_stripe, remove
 from vli_mapping.keyframe import MapKeyframe
 from vli_mapping.light import Light
 from vli_mapping.normals import refine_normals, smooth_normals
+from vli_mapping.pieces import Pieces
 from vli_mapping.spatial_hash import NONE, SpatialHash, link
 from vli_mapping.thinning import thin
 
@@ -148,6 +149,7 @@ class PointMap:
         self.keyframes: list[MapKeyframe] = []
         """Views by which a scanner finds its way back, in order of time."""
         self._state = np.array([0, NONE, 0], np.int64)
+        self._pieces = Pieces(capacity, allocate)
         c = self.config
         self._limits = (
             c.merge_radius, float(np.cos(np.radians(c.merge_angle_deg))), c.merge_colour, c.max_weight, c.fill_radius
@@ -187,6 +189,8 @@ class PointMap:
             self._limits,
             target,
         )
+        seen = (stripe.points, stripe.points - stripe.viewpoint, stripe.sigma, stripe.number)
+        self._pieces.join(self.grid, (c.position, c.scan), seen, target)
         return target
 
     def add_weight(self, target: IntArray, more: Float32Array) -> None:
@@ -217,6 +221,18 @@ class PointMap:
         gone = which[(c.weight[which] <= 1.0) | ~c.solid[which]]
         self.remove(gone)
         return len(gone)
+
+    def remove_with(self, rows: IntArray, seen: FloatArray, number: int) -> int:
+        """Let the rest of the pieces leave that lost too much with those of ``rows`` (K,) that have just left; say how many do.
+
+        Args:
+            rows: contradicted, see :meth:`halve`; some of them several times.
+            seen: (K, 3), what was seen there instead.
+            number: of the scan.
+        """
+        c = self.columns
+        columns = c.position, c.weight, c.scan
+        return self._pieces.leave(self.grid, self._state, columns, (rows, seen, number), self.config.piece_share)
 
     def remove(self, which: IntArray) -> None:
         """Let the points of rows ``which`` (K,), all of which hold one, leave."""
@@ -297,6 +313,7 @@ class PointMap:
         capacity = max(needed, int(_GROWTH * len(self.columns.weight)))
         self.columns.grow(capacity, self.rows, self._allocate)
         self.grid.reserve(capacity, self.columns.position, self.columns.weight[: self.rows] > 0)
+        self._pieces.reserve(capacity)
 
 
 def to_bytes(colours: Float32Array) -> ByteArray:

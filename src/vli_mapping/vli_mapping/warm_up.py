@@ -34,7 +34,7 @@ def warm_up() -> None:
         solid = away_from_edges(row, sigma, entry) & supported(row, row, entry.support_radius) & facing(row, normals, 80.0)
         solid[::3] = ~noisy(row, sigma, entry.max_blur)[::3] & (number % 2 == 0)
         stripe = Stripe(0, number, np.eye(4), row, normals, planarity, np.zeros((64, 3), np.float32), sigma, solid)
-        stripe, _ = contradict(point_map, stripe)
+        stripe, *_ = contradict(point_map, stripe)
         point_map.refine_normals(np.unique(point_map.insert(stripe).clip(0)), np.zeros(3))
     c = point_map.columns
     SpatialHash.of(points, limits.normal_radius).reserve(1 << 12, points, np.ones(64, np.bool_))

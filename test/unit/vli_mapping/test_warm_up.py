@@ -10,6 +10,7 @@ import numpy as np
 from numba.core.dispatcher import Dispatcher
 
 from vli_mapping.config import MapConfig
+from vli_mapping.contradiction import contradict
 from vli_mapping.point_map import PointMap, Stripe
 from vli_mapping.warm_up import warm_up
 
@@ -27,8 +28,16 @@ for number in range(60):
     points = np.stack([side, np.full(count, 3e-4 * number), np.full(count, 0.03)], axis=1)
     normals, solid = np.tile(np.float32([0, 0, -1]), (count, 1)), np.ones(count, np.bool_)
     colours, sigma = np.zeros((count, 3), np.float32), np.full(count, 3e-5)
-    point_map.insert(Stripe(0, number, np.eye(4), points, normals, np.ones(count, np.float32), colours, sigma, solid))
-print(len(point_map))
+    stripe = Stripe(0, number, np.eye(4), points, normals, np.ones(count, np.float32), colours, sigma, solid)
+    point_map.insert(contradict(point_map, stripe)[0])
+# What is in front of them.
+before = len(point_map)
+for number in range(60, 70):
+    near = Stripe(0, number, np.eye(4), 1.1 * points, normals, np.ones(count, np.float32), colours, sigma, solid)
+    contradict(point_map, near)
+if len(point_map) == before:
+    raise SystemExit("nothing was contradicted")
+print(before)
 """
 
 
