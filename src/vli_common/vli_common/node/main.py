@@ -49,7 +49,12 @@ def run_node(factory: Callable[[], VliNode]) -> NoReturn:
     sys.stdout.flush()
     sys.stderr.flush()
     leave_after(_RELEASE_S, code)
-    middleware.close()
+    try:
+        middleware.close()
+    except Exception as error:
+        # All is saved, and the process ends in any case: that is worth a line, and no other exit code.
+        sys.stderr.write(f"the middleware did not let go of the node: {error}\n")
+        sys.stderr.flush()
     # Nothing is left to do, and the interpreter takes a second to take down what it has loaded. It must not do so under a kernel
     # that is being compiled, which cannot be interrupted.
     os._exit(code)
