@@ -10,7 +10,7 @@ from numba import njit
 
 from vli_common.arrays import BoolArray, Float32Array, FloatArray
 from vli_mapping.config import EntryConfig
-from vli_mapping.spatial_hash import SpatialHash, any_near
+from vli_mapping.spatial_hash import SpatialHash, any_near, coordinates
 
 _NOISE_SIGMAS = 3.0
 
@@ -86,4 +86,4 @@ def jumps(a, b, sigma, edge_jump, slope):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _mark_supported(heads, following, beside, cell_m, points, radius, result):  # type: ignore[no-untyped-def]
     for index in range(len(points)):
-        result[index] = any_near(heads, following, beside, points[index], radius, cell_m)
+        result[index] = any_near(heads, following, beside, coordinates(points, index), radius, cell_m)
