@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from vli_common.arrays import FloatArray, Int32Array, IntArray
+from vli_common.errors import InputError
 from vli_common.geometry import transform
 from vli_mapping.allocation import Allocate, in_memory
 from vli_mapping.config import MapConfig
@@ -42,8 +43,11 @@ def merge_maps(
     whole, light = restore(first, config, allocate), first.light
     del first
     registrations = []
-    for snapshot in rest:
-        found = register(_surface(view(whole, light)), _surface(snapshot))
+    for number, snapshot in enumerate(rest, start=2):
+        try:
+            found = register(surface_of_map(view(whole, light)), surface_of_map(snapshot))
+        except InputError as error:
+            raise InputError(f"map '{number}' does not join those before it: {error}") from error
         join(whole, snapshot, found.T_target_source, light)
         registrations.append(found)
     return view(whole, light), registrations
@@ -107,7 +111,7 @@ def relit(snapshot: Snapshot, light: Light | None) -> Snapshot:
     return replace(snapshot, columns=replace(snapshot.columns, colour=colour), light=light)
 
 
-def _surface(snapshot: Snapshot) -> Surface:
+def surface_of_map(snapshot: Snapshot) -> Surface:
     """Return the surface of a map, thinned piece by piece before anything is made of it."""
     columns, kept = snapshot.columns, [np.empty(0, np.int64)]
     for start in range(0, len(snapshot), _CHUNK_ROWS):

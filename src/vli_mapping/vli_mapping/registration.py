@@ -109,7 +109,7 @@ def register(target: Surface, source: Surface, seed: int = 0) -> Registration:
     Raises:
         InputError: they share too little, or could lie in each other in more than one way.
     """
-    found = [refine(target, source, T) for T in [np.eye(4), *_candidates(target, source, np.random.default_rng(seed))]]
+    found = [refine(target, source, T) for T in [np.eye(4), *candidates(target, source, np.random.default_rng(seed))]]
     found.sort(key=lambda item: -item.score)
     best = found[0]
     if best.doubt:
@@ -223,7 +223,7 @@ def _step(points: FloatArray, targets: FloatArray, normals: FloatArray) -> Float
     return motion
 
 
-def _candidates(target: Surface, source: Surface, rng: np.random.Generator) -> list[FloatArray]:
+def candidates(target: Surface, source: Surface, rng: np.random.Generator) -> list[FloatArray]:
     """Return up to five distinct transforms with the most matches of features in place, best first."""
     a, b = _keypoints(source), _keypoints(target)
     first, second = _matches(describe(a), describe(b))
