@@ -2,10 +2,10 @@
 
     python test/perf/bench_merging.py RECORDING HALF HALF [RECORDING HALF HALF ...]
 
-RECORDING has ``truth.tum``; each HALF is what ``vli run`` made of a part of it, with ``--duration`` and ``--start``. The right join
-is refined from the true poses. The wrong ones begin elsewhere: one key beside (19 mm along the axes of the truth, or a row on), at
-random places and turned half round, and with the second half mirrored. Every half is put to the halves of the other recordings
-too. One row each; of the wrong ones that which most speaks for.
+RECORDING has ``truth.tum``; each HALF is what ``vli run`` made of a part of it, with ``--duration`` and ``--start``. The right
+join is refined from the true poses. The wrong ones begin elsewhere: one key beside (19 mm along the axes of the truth, or a row
+on), at random places and turned half round, and with the second half mirrored. Every half is put to the halves of the other
+recordings too. One row each; of the wrong ones that which most speaks for.
 """
 
 from __future__ import annotations
