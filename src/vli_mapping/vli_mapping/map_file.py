@@ -41,6 +41,8 @@ _VIEWS = "views"
 _ALBEDO = {"albedo": (3,), "albedo_weight": (), "albedo_power": ()}
 """What version 3 brought."""
 _MAX_HEADER_BYTES = 1 << 16
+_QUOTED = 100
+"""Characters of a library's message: some quote the file."""
 _CHUNK_BYTES, _CHUNK_ROWS = 1 << 20, 1 << 18
 """Read, and looked at, at a time."""
 _REACH_M = 1e4
@@ -123,12 +125,12 @@ def _reading(path: Path) -> Iterator[zipfile.ZipFile]:
             yield archive
     except zipfile.BadZipFile as error:
         raise InputError(
-            f"'{path}' is no map or a damaged one ({error}), expected what 'vli run' writes as 'map{SUFFIX}'"
+            f"'{path}' is no map or a damaged one ({str(error)[:_QUOTED]}), expected what 'vli run' writes as 'map{SUFFIX}'"
         ) from error
     except OSError as error:
         raise InputError(f"'{path}' cannot be read: {error.strerror or error}") from error
     except (*_DAMAGED, tokenize.TokenError) as error:
-        raise InputError(f"map '{path}' is damaged ({error}); save it again") from error
+        raise InputError(f"map '{path}' is damaged ({str(error)[:_QUOTED]}); save it again") from error
 
 
 def _names(version: int = VERSION) -> tuple[str, ...]:

@@ -192,7 +192,10 @@ def compress(path: Path) -> None:
         (lambda path: rewrite(path, header(points=7)), "do not belong together"),
         (lambda path: rewrite(path, lambda name, data: None if "descriptors" in name else data), "damaged.*descriptors"),
         (lambda path: rewrite(path, column("albedo_weight", lambda values: -values)), "damaged.*nowhere, or look like nothing"),
-        (lambda path: rewrite(path, column("albedo", lambda values: np.full_like(values, np.inf))), "damaged.*nowhere, or look like nothing"),
+        (
+            lambda path: rewrite(path, column("albedo", lambda values: np.full_like(values, np.inf))),
+            "damaged.*nowhere, or look like nothing",
+        ),
         (lambda path: rewrite(path, column("keyframe_poses", lambda values: 2 * values)), "damaged.*keyframes are nowhere"),
         (lambda path: rewrite(path, column("keyframe_points", lambda values: np.nan * values)), "damaged.*keyframes are nowhere"),
         (lambda path: rewrite(path, column("keyframe_depths", lambda values: -values)), "damaged.*keyframes are nowhere"),
@@ -233,6 +236,19 @@ def test_one_flipped_bit_is_noticed(snapshot: Snapshot, tmp_path: Path) -> None:
     path.write_bytes(data)
     with pytest.raises(InputError, match=r"map\.vli"):
         load_map(path)
+
+
+def test_a_file_whose_entry_names_itself_by_half_the_file_is_one_short_line(snapshot: Snapshot, tmp_path: Path) -> None:
+    path = tmp_path / "map.vli"
+    save_map(path, snapshot)
+    with zipfile.ZipFile(path) as archive:
+        start = archive.getinfo("position.npy").header_offset
+    content = bytearray(path.read_bytes())
+    content[start + 26 : start + 28] = (5000).to_bytes(2, "little")
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="is no map or a damaged one") as caught:
+        load_map(path)
+    assert len(str(caught.value)) < 250 + len(str(path))
 
 
 def test_an_array_of_objects_is_never_unpickled(snapshot: Snapshot, tmp_path: Path) -> None:
