@@ -25,6 +25,8 @@ LAPS = 10
 """Of 50 s each: eight minutes."""
 SETTLED = 3
 """Laps after which caches and buffers are full."""
+BUFFERS_MB = 40.0
+"""What fills up to a limit of its own, and may go on doing so: photographs, sightings of the light, times of the frames."""
 TURN_S = 24.8
 """There the scanner of the recording stands still, to 1 mm/s, so that it can go back the same way."""
 REST = Span(0.0, 1.0)
@@ -110,7 +112,7 @@ def test_f29_eight_minutes_over_the_same_keys_in_one_session_add_nothing_up(shar
     assert all(item.states == {TrackingState.TRACKING} for item in laps[1:]), told
     assert last.error_mm < 1.5 * settled.error_mm + 0.02, told
     assert max(item.error_mm for item in laps) < 0.2, told
-    assert last.memory_mb < 1.03 * settled.memory_mb, told
+    assert last.memory_mb < settled.memory_mb + BUFFERS_MB, told
     assert last.points < 1.03 * settled.points, told
     assert last.keyframes <= 1.03 * settled.keyframes, told
     pipeline.flush()
