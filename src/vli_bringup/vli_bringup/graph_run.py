@@ -136,28 +136,29 @@ def run_graph(
         wall_s = time.perf_counter() - begin_s
         problems = [_hand_over(listener)] if stop.is_set() else []
         problems += [_call(listener, f"{MAPPING}/save", _SAVE_S)] if listener.value(MAPPING, "points") else []
-    recorder.write(directory)
-    latencies.write(directory / "timing.csv")
-    summary = {
-        "frames_long": listener.value(_DEMUX, "stage.long"),
-        "frames_short": listener.value(_DEMUX, "stage.short"),
-        "frames_with_pose": len(recorder.live),
-        "keyframes": recorder.keyframes,
-        "points": _write_map(directory, options.settings),
-        "states": recorder.states,
-        "reason": recorder.reason,
-        "startup_s": round(begin_s - started_s, 3),
-        "wall_s": round(wall_s, 3),
-        "cpu_s": round(sum(float(status.values["cpu_s"]) for status in listener.statuses.values()), 3),
-        "realtime_factor": round(data_s / wall_s, 3) if options.playback else None,
-        **latencies.summary(),
-        "drops": listener.losses(),
-        "problems": [text for text in problems if text],
-        "restarts": processes.restarts,
-        "interrupted_s": round(data_s, 3) if stop.is_set() and options.playback else None,
-        "nodes": {name: dict(sorted(status.values.items())) for name, status in sorted(listener.statuses.items())},
-    }
-    (directory / SUMMARY).write_text(json.dumps(summary, indent=1) + "\n")
+        # All is on the disk before the graph is left: what the middleware does then is not ours.
+        recorder.write(directory)
+        latencies.write(directory / "timing.csv")
+        summary = {
+            "frames_long": listener.value(_DEMUX, "stage.long"),
+            "frames_short": listener.value(_DEMUX, "stage.short"),
+            "frames_with_pose": len(recorder.live),
+            "keyframes": recorder.keyframes,
+            "points": _write_map(directory, options.settings),
+            "states": recorder.states,
+            "reason": recorder.reason,
+            "startup_s": round(begin_s - started_s, 3),
+            "wall_s": round(wall_s, 3),
+            "cpu_s": round(sum(float(status.values["cpu_s"]) for status in listener.statuses.values()), 3),
+            "realtime_factor": round(data_s / wall_s, 3) if options.playback else None,
+            **latencies.summary(),
+            "drops": listener.losses(),
+            "problems": [text for text in problems if text],
+            "restarts": processes.restarts,
+            "interrupted_s": round(data_s, 3) if stop.is_set() and options.playback else None,
+            "nodes": {name: dict(sorted(status.values.items())) for name, status in sorted(listener.statuses.items())},
+        }
+        (directory / SUMMARY).write_text(json.dumps(summary, indent=1) + "\n")
     return summary
 
 

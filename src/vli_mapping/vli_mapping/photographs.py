@@ -58,7 +58,7 @@ class Photograph:
     def of(pixels: ByteArray, T_map_camera: FloatArray, depth: float) -> Photograph:
         """Encode an image (H, W, 3) BGR or (H, W) grey."""
         _, encoded = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
-        return Photograph(encoded.ravel(), T_map_camera, depth)
+        return Photograph(encoded.ravel(), T_map_camera.copy(), depth)
 
     def pixels(self) -> ByteArray:
         """Return the image (H, W, 3) BGR or (H, W) grey."""
@@ -83,8 +83,9 @@ class Album:
         """
         if self._latest is not None and _is_alike(self._latest, T_map_camera, self._spacing * depth):
             return
-        self._latest = T_map_camera
-        self.photographs.append(Photograph.of(image.pixels, T_map_camera, depth))
+        photograph = Photograph.of(image.pixels, T_map_camera, depth)
+        self._latest = photograph.T_map_camera
+        self.photographs.append(photograph)
         if len(self.photographs) > _MOST:
             self.photographs = self.photographs[::2]
             self._spacing *= 2.0
