@@ -87,12 +87,13 @@ def test_the_final_trajectory_has_the_frames_of_the_live_one_nearby(results):
 
 
 def test_timing_has_a_row_a_long_frame_and_makes_up_the_summary(results, summary):
-    """Camera and map have their own threads: a frame takes no less than the main thread's stages, and less than all of them."""
+    """Camera and map have their own threads: a frame takes no less than the main thread's back end, and less than all stages."""
     rows = list(csv.DictReader((results / "timing.csv").open()))
     assert len(rows) == summary["frames_long"]
     totals = [float(row["total_ms"]) for row in rows]
     by_stage = {stage: np.array([float(row[f"{stage}_ms"]) for row in rows]) for stage in STAGES}
-    assert (totals > by_stage["frontend"] + by_stage["backend"] - 0.01).all()
+    # The camera's thread makes ready what the front end follows.
+    assert (totals > by_stage["backend"] - 0.01).all()
     assert np.mean(totals) < np.mean(sum(by_stage.values()))
     assert np.mean(totals) == pytest.approx(summary["ms_per_frame_mean"], abs=0.01)
     assert sum(totals) < 1e3 * summary["wall_s"]

@@ -183,14 +183,16 @@ def _read(file: Path) -> AnyArray | None:
 
 def _quiet_decode(data: bytes) -> AnyArray | None:
     """Decode without OpenCV's own lines on stderr: the error that follows says it in one."""
-    level = cv2.utils.logging.getLogLevel()
-    cv2.utils.logging.setLogLevel(0)
+    # Older OpenCVs have the two functions in cv2 itself.
+    logging = getattr(cv2.utils, "logging", cv2)
+    level = logging.getLogLevel()
+    logging.setLogLevel(0)
     try:
         return cast("AnyArray | None", cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED))
     except cv2.error:
         return None
     finally:
-        cv2.utils.logging.setLogLevel(level)
+        logging.setLogLevel(level)
 
 
 def _bits_beyond_8(images: Iterable[AnyArray]) -> int:

@@ -72,7 +72,11 @@ class FakeFrontEnd:
     def __init__(self, log, uses_imu=True):
         self.log, self.uses_imu, self.waiting = log, uses_imu, []
 
-    def add_image(self, image):
+    def prepare(self, image):
+        return image.stamp_ns
+
+    def add_image(self, image, prepared):
+        assert prepared == image.stamp_ns
         self.log.append(("front", "image", image.stamp_ns))
         self.waiting.append(image)
         return [] if self.uses_imu else self._answer()
@@ -216,7 +220,7 @@ def test_what_comes_out_does_not_depend_on_which_thread_is_faster(log, monkeypat
         stages = Stages(FakeDemultiplexer(), FakeScanner(), FakeFrontEnd(delayed), FakeBackEnd(delayed), FakeMapper(delayed))
         original = getattr(slow, method)
         with monkeypatch.context() as patch:
-            patch.setattr(slow, method, lambda self, item, original=original: (time.sleep(0.01), original(self, item))[1])
+            patch.setattr(slow, method, lambda self, *items, original=original: (time.sleep(0.01), original(self, *items))[1])
             slowed = Pipeline(stages, Mode.VLI_SLAM)
             play(slowed)
             slowed.flush()
