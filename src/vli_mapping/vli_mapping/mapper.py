@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -121,16 +122,23 @@ class Mapper:
         return self._change.hint if self.is_located else "the place in the map is not known yet: go over a part that is mapped"
 
     def cloud(self, max_points: int | None = None, stamp_ns: int = 0, session: int = 0) -> PointCloud:
-        """Return the map, colours as the config asks for; thinned to ``max_points`` where given, each colour then by itself."""
+        """Return the map, colours as the config asks for.
+
+        Thinned to ``max_points`` where given, each colour then by itself, and in the light as it was found last.
+        """
         self.settle()
-        light, as_seen = self.light(), self.config.colour == AS_SEEN
+        as_seen = self.config.colour == AS_SEEN
         if max_points is None:
-            return finished_cloud(self.map, light, as_seen, stamp_ns, session)
-        return self.map.thinned(max_points, stamp_ns, session, light, as_seen)
+            return finished_cloud(self.map, self.light(), as_seen, stamp_ns, session)
+        return self.map.thinned(max_points, stamp_ns, session, self._light.latest, as_seen)
 
     def light(self) -> Light | None:
         """Return the light on board and the lens as all scans so far tell of them; None while they tell too little."""
-        return self._light.fit()
+        return self.light_fit()()
+
+    def light_fit(self) -> Callable[[], Light | None]:
+        """Return what finds the light, for another thread: it takes a tenth of a second, in which scans may go on entering."""
+        return self._light.pending()
 
     def photographs(self) -> tuple[Photograph, ...]:
         """Return the images that the map does not have the albedo of yet."""

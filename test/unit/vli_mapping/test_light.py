@@ -170,3 +170,28 @@ def test_the_number_of_spots_is_bounded_and_their_fit_repeatable() -> None:
     assert one is not None
     assert two is not None
     np.testing.assert_array_equal(one.position, two.position)
+
+
+def test_spots_that_come_while_a_fit_is_under_way_are_in_the_next() -> None:
+    rng = np.random.default_rng(2)
+
+    def lot() -> Sightings:
+        points = np.repeat(rng.uniform([-0.01, -0.01, 0.03], [0.01, 0.01, 0.04], (250, 3)), 2, axis=0)
+        return Sightings(np.repeat(np.arange(250), 2), rng.uniform(50, 60, 500), points, np.tile([0.0, 0.0, -1.0], (500, 1)))
+
+    estimator, alone = LightEstimator(), LightEstimator()
+    first = lot()
+    estimator.add(first)
+    alone.add(first)
+    under_way = estimator.pending()
+    estimator.add(lot())
+    assert estimator.latest is None
+    found, expected = under_way(), alone.fit()
+    assert found is not None
+    assert expected is not None
+    np.testing.assert_array_equal(found.position, expected.position)
+    assert estimator.latest is found
+    later = estimator.fit()
+    assert later is not None
+    assert later is not found
+    assert estimator.pending()() is later

@@ -14,7 +14,7 @@ from rclpy.parameter import Parameter
 from vli_common.messages import image_to_cdr, scan_to_message, status_to_message
 from vli_common.node import inputs
 from vli_common.status import Health, NodeState, StageStatus
-from vli_common.topics import IMAGE_LONG, LASER_POINTS, STATUS
+from vli_common.topics import IMAGE_LONG, LASER_POINTS, MAP, STATUS
 from vli_common.types import Image, LaserScan
 from vli_mapping.nodes.mapping_node import MappingNode
 
@@ -99,3 +99,31 @@ def test_a_node_that_is_stopped_lets_an_automatic_save_end_and_saves_what_came_s
     assert node.close()
     timer.join()
     assert done == saves
+
+
+def test_the_light_is_found_beside_the_worker_and_the_map_published_after_it(node, monkeypatch):
+    under_way, go_on, done = threading.Event(), threading.Event(), []
+
+    def fit() -> None:
+        under_way.set()
+        assert go_on.wait(10.0)
+        done.append(threading.current_thread() is threading.main_thread())
+
+    monkeypatch.setattr(node, "call", lambda job: job())
+    monkeypatch.setattr(node, "enqueue", lambda job: done.append(job.__name__))
+    monkeypatch.setattr(node, "has_listener", lambda topic: topic is MAP)
+    node._mapper = SimpleNamespace(light_fit=lambda: fit, map=[])
+    for _ in range(3):
+        node._look_after_map()
+    assert under_way.wait(10.0)
+    assert not done
+    go_on.set()
+    assert node._lighting.acquire(timeout=10.0)
+    assert done == [False, "_publish_map"]
+
+
+def test_where_nobody_looks_no_light_is_sought(node, monkeypatch):
+    monkeypatch.setattr(node, "has_listener", lambda _: False)
+    node._mapper = SimpleNamespace(map=[])
+    node._look_after_map()
+    assert not node._lighting.locked()

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -81,10 +83,10 @@ class MappingNode(VliNode):
         self.serve("export", self._export, aside=True)
         self.serve("clear", self._clear, aside=True)
         self._is_resumed = False
-        self._saving = threading.Lock()
+        self._saving, self._lighting = threading.Lock(), threading.Lock()
         self.every(_AUTOSAVE_CHECK_S, self._look_after_autosave)
         self._autosaved_s = time.monotonic()
-        self.every(_MAP_PERIOD_S, lambda: self.enqueue(self._publish_map))
+        self.every(_MAP_PERIOD_S, self._look_after_map)
 
     def create_stage(self, calibration: Calibration | None) -> None:
         """Make the mapper."""
@@ -107,6 +109,8 @@ class MappingNode(VliNode):
 
     def on_finish(self) -> None:
         """Publish the map as it is in the end."""
+        if self._mapper is not None:
+            self._mapper.light()
         self._publish_map()
 
     def stage_counters(self) -> Counters:
@@ -144,6 +148,21 @@ class MappingNode(VliNode):
             self.send(CLOUD, cloud_to_message(output.cloud))
         if output.update is not None and self.has_listener(MAP_UPDATE):
             self.send(MAP_UPDATE, cloud_to_message(output.update))
+
+    def _look_after_map(self) -> None:
+        """Find the light anew where someone looks, then publish the map; in a thread of its own, and never two at a time."""
+        is_watched = self.has_listener(MAP) or self.has_listener(MAP_UPDATE)
+        if self._mapper is not None and is_watched and self._lighting.acquire(blocking=False):
+            threading.Thread(target=self._publish_in_light, daemon=True).start()
+
+    def _publish_in_light(self) -> None:
+        # A node that is busy, or cleaned up meanwhile, is asked again.
+        try:
+            with suppress(VliError):
+                self.call(self.mapper.light_fit)()
+                self.enqueue(self._publish_map)
+        finally:
+            self._lighting.release()
 
     def _publish_map(self) -> None:
         """Publish the whole map where someone listens and it has changed."""
@@ -244,26 +263,27 @@ class MappingNode(VliNode):
 
         With the scans of the window as they are now; the map itself gets them when their poses are final.
         """
+        light = self.call(self._settled_fit)()
         waiting, photographs = self.call(self.mapper.waiting), self.call(self.mapper.photographs)
-        snapshot = take(self.mapper.map, self.call(self._settled_light), self.call)
+        snapshot = take(self.mapper.map, light, self.call)
         whole = restore(snapshot, self.parameters.config(MappingConfig).map)
         for stripe in waiting:
             whole.insert(stripe)
         if not len(whole):
             raise OutputError(f"the map is empty, '{path}' is not written")
-        develop(whole, snapshot.light, self.mapper.camera, photographs)
-        return whole, snapshot.light
+        develop(whole, light, self.mapper.camera, photographs)
+        return whole, light
 
     def _snapshot(self, path: Path) -> Snapshot:
-        light = self.call(self._settled_light)
+        light = self.call(self._settled_fit)()
         snapshot = take(self.mapper.map, light, self.call)
         if not len(snapshot):
             raise OutputError(f"the map is empty, '{path}' is not written")
         return snapshot
 
-    def _settled_light(self) -> Light | None:
+    def _settled_fit(self) -> Callable[[], Light | None]:
         self.mapper.settle()
-        return self.mapper.light()
+        return self.mapper.light_fit()
 
     def _cloud(self, path: Path) -> PointCloud:
         as_seen = self.parameters.config(MappingConfig).colour == AS_SEEN
