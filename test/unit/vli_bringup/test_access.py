@@ -21,7 +21,7 @@ NODES = {
 }  # fmt: skip
 WITHOUT_TF2 = {"/tf", "/tf_static"}
 """Published only where tf2_msgs is installed."""
-HEARD_OF_S = 5.0
+HEARD_OF_S = 60.0
 """The graph hears of what a node has opened in time."""
 CLOCK = {"/clock"}
 """Heard only with use_sim_time."""
