@@ -1,15 +1,22 @@
 """Colours of a finished map without the light on board: what single points do not tell, their neighbourhood does.
 
-A colour divided by the shading of its view (see ``light``) is the better the more light there was. On a flank, an error δ of the
-normal is one of tan β · δ in the shading; on an edge the normal itself means little; in a shadow the shading is something else
-altogether. So the normals of this correction are means over the neighbours on the same face, points that others keep from the
-light are found, and each colour is drawn towards that of its neighbourhood by how much it is to be doubted: with the doubt d, a
-variance in units of how colours vary from point to point, it keeps the share 1 / (1 + d).
+A point's albedo is what the images around its stripe and all photographs of it say together, ρ = Σ c E / Σ E² (``photographs``).
+Its error is that of the shading E. On a flank, an error δ of the normal is one of tan β · δ; on an edge the normal itself means
+little; in a shadow the light is something else altogether. So the normals of E are means over the neighbours on the same face,
+and points that others keep from the light are found. What is left is told by views that do not agree (misfit), and by normals
+that scatter. Both are taken over the neighbourhood: light is smooth over a face, and where only a few neighbours do not agree it
+is print, which pixels that are off by one show lighter here and darker there.
+
+A neighbourhood has a level, the mean over the face, and details, which differ from it. Where the light is doubted, the level is
+drawn towards that of all around that is doubted less, by one factor for the whole face: print keeps its contrast. The details
+keep the share V / (V + V₀), V their variance and V₀ that of their error: the best linear estimate (after Lee, "Digital image
+enhancement and noise filtering by use of local statistics", 1980), but that V has the error in it and so errs on the side of
+detail. Points that may fly, that have no normal or that the light does not reach take the colour around instead.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -18,9 +25,9 @@ from vli_common.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from vli_common.types import PointCloud
 from vli_mapping.light import Light
 from vli_mapping.normals import MAX_NEIGHBOURS
-from vli_mapping.point_map import Columns, PointMap, to_bytes
+from vli_mapping.point_map import PointMap, to_bytes
 from vli_mapping.ray_casting import cast, direct
-from vli_mapping.spatial_hash import SpatialHash, neighbours
+from vli_mapping.spatial_hash import SpatialHash, coordinates, neighbours
 
 _REACH = 2.0
 """Times the radius of the normals: the neighbourhood."""
@@ -28,9 +35,17 @@ _SPARSE = 3
 """One in so many points is a neighbour: those along a stripe say the same."""
 _SAME_FACE = float(np.cos(np.radians(40.0)))
 """Cosine between normals of one face: nearer than the flank of a key is to its top."""
-_UNLIT, _ENOUGH, _MISFIT, _CURVED = 0.4, 3.0, 200.0, 1.0
-"""Doubt of a point that has been in the light of the reference once less than in enough of it; of one whose views have nothing in
-common; and per unit of the tan² that the scatter of the normals around comes to."""
+_NOISE = 2.0
+"""Grey levels, one standard deviation of a pixel."""
+_MISFIT, _CURVED = 4.0, 0.4
+"""Variance of a detail's error, as a share of the squared level: per misfit, and per unit of the tan² that the scatter of the
+normals around comes to."""
+_LEAST_MISFIT = 3e-4
+"""It is the noise of the images that makes less."""
+_MISFIT_DOUBT, _CURVED_DOUBT = 200.0, 2.0
+"""Doubt of a level, likewise; a level of doubt d keeps the share 1 / (1 + d)."""
+_MOST_GAIN = 4.0
+"""Of the factor that draws a level, or the least as its inverse."""
 _LEAST_WEIGHT = 1e-3
 _ROUGH, _SHADOWED = 4.0, 10.0
 """Doubt of a point that has no normal of its own or may fly, and of one that the light does not reach."""
@@ -70,20 +85,12 @@ def albedo(point_map: PointMap, light: Light) -> Float32Array:
     c, which = point_map.columns, point_map.alive()
     around = _neighbourhood(point_map, which)
     normals, agreement = around.mean_normals(c.normal[which])
-    shading, dark = np.empty(len(which)), np.empty(len(which), np.bool_)
+    views = _Views.empty(len(which))
     for start in range(0, len(which), _CHUNK):
         part = slice(start, start + _CHUNK)
-        shading[part], dark[part] = light_on(point_map, light, which[part], normals[part])
-    colours, weight, misfit = _by_all_views(c.at(which), shading)
-    doubt = (
-        _UNLIT * np.maximum(1.0 / weight - 1.0 / _ENOUGH, 0.0)
-        + _MISFIT * misfit
-        + _CURVED * (1.0 / agreement**2 - 1.0)
-        + _ROUGH * ~c.normal[which].any(axis=1)
-        + _ROUGH * ~c.solid[which]
-        + _SHADOWED * dark
-    )
-    return around.blend(colours, doubt)
+        views.fill(part, point_map, light, which[part], normals[part])
+    rough = _ROUGH * (~c.normal[which].any(axis=1)).astype(np.float32) + _ROUGH * ~c.solid[which]
+    return around.blend(normals, views, 1.0 / agreement**2 - 1.0, rough + _SHADOWED * views.shadowed)
 
 
 def mean_normals(point_map: PointMap, which: IntArray) -> Float32Array:
@@ -91,21 +98,41 @@ def mean_normals(point_map: PointMap, which: IntArray) -> Float32Array:
     return _neighbourhood(point_map, which).mean_normals(point_map.columns.normal[which])[0]
 
 
-def _by_all_views(points: Columns, shading: FloatArray) -> tuple[Float32Array, FloatArray, FloatArray]:
-    """Return what the views of the colours, of a ``shading`` (K,), and all photographs say together, see ``photographs``.
+@dataclass(frozen=True, slots=True)
+class _Views:
+    """What all views of points say.
 
-    Returns:
-        Albedo (K, 3), Σ E² (K,), and how badly they agree (K,), 0 … 1.
+    Args:
+        colours: (N, 3), albedo; NaN = unknown.
+        weight: (N,), Σ E².
+        misfit: (N,), how badly the views agree, 0 … 1.
+        shadowed: (N,), whether the map keeps the light off.
     """
-    seen = ~np.isnan(points.colour[:, 0])
-    colour, shading = np.where(seen[:, None], points.colour, 0.0), np.where(seen, shading, 0.0)
-    weight = points.albedo_weight + shading**2
-    total = points.albedo * points.albedo_weight[:, None] + colour * shading[:, None]
-    power = points.albedo_power + colour.mean(axis=1) ** 2
-    with np.errstate(invalid="ignore", divide="ignore"):
-        colours = (total / weight[:, None]).astype(np.float32)
-        misfit = np.nan_to_num(1.0 - total.mean(axis=1) ** 2 / (weight * power), posinf=0.0, neginf=0.0)
-    return colours, np.maximum(weight, _LEAST_WEIGHT), np.maximum(misfit, 0.0)
+
+    colours: Float32Array
+    weight: Float32Array
+    misfit: Float32Array
+    shadowed: BoolArray
+
+    @staticmethod
+    def empty(count: int) -> _Views:
+        """Return room for so many points."""
+        narrow = np.float32
+        return _Views(np.empty((count, 3), narrow), np.empty(count, narrow), np.empty(count, narrow), np.empty(count, np.bool_))
+
+    def fill(self, part: slice, point_map: PointMap, light: Light, which: IntArray, normals: Float32Array) -> None:
+        """Fill a part of the rows, that of rows ``which`` (K,) of a map on faces of normals (K, 3)."""
+        c = point_map.columns
+        shading, self.shadowed[part] = light_on(point_map, light, which, normals)
+        seen, known = ~np.isnan(c.colour[which, 0]), c.albedo_weight[which].astype(np.float64)
+        colour, shading = np.where(seen[:, None], c.colour[which], 0.0), np.where(seen, shading, 0.0)
+        weight = known + shading**2
+        total = c.albedo[which] * known[:, None] + colour * shading[:, None]
+        power = c.albedo_power[which] + colour.mean(axis=1) ** 2
+        with np.errstate(invalid="ignore", divide="ignore"):
+            self.colours[part] = total / weight[:, None]
+            misfit = np.nan_to_num(1.0 - total.mean(axis=1) ** 2 / (weight * power), posinf=0.0, neginf=0.0)
+        self.weight[part], self.misfit[part] = np.maximum(weight, _LEAST_WEIGHT), np.maximum(misfit, 0.0)
 
 
 def _neighbourhood(point_map: PointMap, which: IntArray) -> _Neighbourhood:
@@ -141,46 +168,61 @@ class _Neighbourhood:
     """Points (N, 3) and those of them within a radius, metres, that count as neighbours."""
 
     def __init__(self, points: FloatArray, radius: float) -> None:
-        self._points, self._sparse, self._radius = points, np.ascontiguousarray(points[::_SPARSE]), radius
-        grid = SpatialHash.of(self._sparse, radius)
-        self._grid = (grid.heads, grid.next, grid.cell_m)
+        self._points, sparse = points, np.ascontiguousarray(points[::_SPARSE])
+        grid = SpatialHash.of(sparse, radius)
+        self._around = (grid.heads, grid.next, grid.cell_m, sparse, radius)
 
-    def mean_normals(self, normals: Float32Array) -> tuple[Float32Array, FloatArray]:
+    def mean_normals(self, normals: Float32Array) -> tuple[Float32Array, Float32Array]:
         """Return the mean normal (N, 3) of the face that each point is on, 0 where none is known, and the agreement (N,).
 
         That is the length of the sum over the number of all normals (N, 3) around; those of other faces are not in the sum.
         """
-        mean, agreement = np.empty_like(normals), np.empty(len(normals))
-        beside = np.ascontiguousarray(normals[::_SPARSE])
-        _average_normals(self._grid, self._sparse, beside, self._radius, self._points, normals, mean, agreement)
+        mean, agreement = np.empty_like(normals), np.empty(len(normals), np.float32)
+        _average_normals(self._around, self._points, normals, mean, agreement)
         return mean, agreement
 
-    def blend(self, colours: Float32Array, doubt: FloatArray) -> Float32Array:
-        """Return colours (N, 3) drawn, by their doubt (N,), towards the mean of the neighbours, which counts these by theirs."""
-        result = np.empty_like(colours)
-        beside, weight = np.ascontiguousarray(colours[::_SPARSE]), 1.0 / (doubt[::_SPARSE] + _LEAST)
-        _blend(self._grid, self._sparse, beside, weight, self._radius, self._points, colours, doubt, result)
+    def blend(self, normals: Float32Array, views: _Views, scatter: Float32Array, doubt: Float32Array) -> Float32Array:
+        """Return the colours (N, 3) of views, levels and details drawn as the module says.
+
+        Args:
+            normals: (N, 3), of the faces.
+            views: of all points.
+            scatter: (N,), tan² of the normals around.
+            doubt: (N,), of the point itself.
+        """
+        misfit, result = np.empty_like(views.misfit), np.empty_like(views.colours)
+        _pool(self._around, self._points, normals, views.misfit, misfit)
+        in_level = _MISFIT_DOUBT * misfit + _CURVED_DOUBT * scatter
+        trust = 1.0 / (in_level + doubt + _LEAST)
+        error = _MISFIT * misfit + _CURVED * scatter
+        shown = (views.colours, views.weight, views.shadowed)
+        _blend(self._around, self._points, normals, shown, (in_level, doubt, trust, error), result)
         return result
 
 
 @njit(cache=True, nogil=True)
-def _average_normals(grid, sparse, beside, radius, points, normals, mean, agreement):  # type: ignore[no-untyped-def]
-    heads, following, cell_m = grid
+def _is_same_face(first, second):  # type: ignore[no-untyped-def]
+    return first[0] * second[0] + first[1] * second[1] + first[2] * second[2] >= _SAME_FACE
+
+
+@njit(cache=True, nogil=True)
+def _average_normals(around, points, normals, mean, agreement):  # type: ignore[no-untyped-def]
+    heads, following, cell_m, sparse, radius = around
     found = np.empty(MAX_NEIGHBOURS, np.int64)
     for index in range(len(points)):
-        count = neighbours(heads, following, sparse, points[index], radius, cell_m, found)
-        own, known = normals[index], 0
+        count = neighbours(heads, following, sparse, coordinates(points, index), radius, cell_m, found)
+        own, known = coordinates(normals, index), 0
         # A point counts for itself: it may be none of the sparse ones.
         x, y, z = np.float64(own[0]), np.float64(own[1]), np.float64(own[2])
         has_own = x != 0 or y != 0 or z != 0
         if has_own:
             known = 1
         for at in found[:count]:
-            n = beside[at]
+            n = coordinates(normals, _SPARSE * at)
             if n[0] == 0 and n[1] == 0 and n[2] == 0:
                 continue
             known += 1
-            if not has_own or own[0] * n[0] + own[1] * n[1] + own[2] * n[2] >= _SAME_FACE:
+            if not has_own or _is_same_face(own, n):
                 x += n[0]
                 y += n[1]
                 z += n[2]
@@ -191,25 +233,68 @@ def _average_normals(grid, sparse, beside, radius, points, normals, mean, agreem
 
 
 @njit(cache=True, nogil=True)
-def _blend(grid, sparse, beside, weight, radius, points, colours, doubt, result):  # type: ignore[no-untyped-def]
-    heads, following, cell_m = grid
-    found, total = np.empty(MAX_NEIGHBOURS, np.int64), np.empty(3)
+def _pool(around, points, normals, misfit, result):  # type: ignore[no-untyped-def]
+    """Take the geometric mean of the misfits (N,) on the same face: what is wrong with the light is wrong at all of them."""
+    heads, following, cell_m, sparse, radius = around
+    found = np.empty(MAX_NEIGHBOURS, np.int64)
+    for index in range(len(points)):
+        count = neighbours(heads, following, sparse, coordinates(points, index), radius, cell_m, found)
+        own, total, beside = coordinates(normals, index), 0.0, 0
+        for at in found[:count]:
+            if _is_same_face(own, coordinates(normals, _SPARSE * at)):
+                total += np.log(misfit[_SPARSE * at] + _LEAST_MISFIT)
+                beside += 1
+        mean = np.exp(total / beside) - _LEAST_MISFIT if beside else misfit[index]
+        result[index] = max(mean, 0.0)
+
+
+@njit(cache=True, nogil=True)
+def _blend(around, points, normals, shown, doubts, result):  # type: ignore[no-untyped-def]
+    heads, following, cell_m, sparse, radius = around
+    colours, weight, shadowed = shown
+    in_level, doubt, trust, error = doubts
+    found, face, all_around = np.empty(MAX_NEIGHBOURS, np.int64), np.empty(3), np.empty(3)
     for index in range(len(points)):
         result[index] = colours[index]
         if np.isnan(colours[index, 0]):
             continue
-        count = neighbours(heads, following, sparse, points[index], radius, cell_m, found)
-        total[:] = 0.0
-        weights = 0.0
-        for at in found[:count]:
-            if not np.isnan(beside[at, 0]):
-                weights += weight[at]
-                for channel in range(3):
-                    total[channel] += weight[at] * beside[at, channel]
-        if weights > 0:
-            share = 1.0 / (1.0 + doubt[index])
+        count = neighbours(heads, following, sparse, coordinates(points, index), radius, cell_m, found)
+        own, grey = coordinates(normals, index), _grey(colours, index)
+        trusts, beside, square = 0.0, 1, grey * grey
+        for channel in range(3):
+            face[channel], all_around[channel] = colours[index, channel], 0.0
+        for found_at in found[:count]:
+            at = _SPARSE * found_at
+            if np.isnan(colours[at, 0]):
+                continue
+            trusts += trust[at]
+            is_alike = shadowed[at] == shadowed[index] and _is_same_face(own, coordinates(normals, at))
             for channel in range(3):
-                result[index, channel] = share * colours[index, channel] + (1.0 - share) * total[channel] / weights
+                all_around[channel] += trust[at] * colours[at, channel]
+                if is_alike:
+                    face[channel] += colours[at, channel]
+            if is_alike:
+                beside += 1
+                square += _grey(colours, at) ** 2
+        if trusts == 0.0:
+            continue
+        face /= beside
+        all_around /= trusts
+        level = face.mean()
+        variance = max(square / beside - level * level, 0.0)
+        wrong = _NOISE**2 / weight[index] + error[index] * level * level
+        detail = variance / (variance + wrong)
+        gain = min(max(all_around.mean() / max(level, 1e-3), 1.0 / _MOST_GAIN), _MOST_GAIN)
+        scale = 1.0 + (gain - 1.0) * in_level[index] / (1.0 + in_level[index])
+        share = 1.0 / (1.0 + doubt[index])
+        for channel in range(3):
+            drawn = scale * (face[channel] + detail * (colours[index, channel] - face[channel]))
+            result[index, channel] = share * drawn + (1.0 - share) * all_around[channel]
+
+
+@njit(cache=True, nogil=True)
+def _grey(colours, index):  # type: ignore[no-untyped-def]
+    return (np.float64(colours[index, 0]) + colours[index, 1] + colours[index, 2]) / 3.0
 
 
 @njit(cache=True, nogil=True)
