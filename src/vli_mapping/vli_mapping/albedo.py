@@ -193,7 +193,8 @@ class _Neighbourhood:
         misfit, result = np.empty_like(views.misfit), np.empty_like(views.colours)
         _pool(self._around, self._points, normals, views.misfit, misfit)
         in_level = _MISFIT_DOUBT * misfit + _CURVED_DOUBT * scatter
-        trust = 1.0 / (in_level + doubt + _LEAST)
+        # As a neighbour, a point is asked for its colour, and there may be better ones: whatever it is that spoils it.
+        trust = 1.0 / (in_level + _MISFIT_DOUBT * views.misfit + doubt + _LEAST)
         error = _MISFIT * misfit + _CURVED * scatter
         shown = (views.colours, views.weight, views.shadowed)
         _blend(self._around, self._points, normals, shown, (in_level, doubt, trust, error), result)
@@ -239,13 +240,12 @@ def _pool(around, points, normals, misfit, result):  # type: ignore[no-untyped-d
     found = np.empty(MAX_NEIGHBOURS, np.int64)
     for index in range(len(points)):
         count = neighbours(heads, following, sparse, coordinates(points, index), radius, cell_m, found)
-        own, total, beside = coordinates(normals, index), 0.0, 0
+        own, total, beside = coordinates(normals, index), np.log(misfit[index] + _LEAST_MISFIT), 1
         for at in found[:count]:
             if _is_same_face(own, coordinates(normals, _SPARSE * at)):
                 total += np.log(misfit[_SPARSE * at] + _LEAST_MISFIT)
                 beside += 1
-        mean = np.exp(total / beside) - _LEAST_MISFIT if beside else misfit[index]
-        result[index] = max(mean, 0.0)
+        result[index] = max(np.exp(total / beside) - _LEAST_MISFIT, 0.0)
 
 
 @njit(cache=True, nogil=True)

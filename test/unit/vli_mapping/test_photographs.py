@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import cv2
 import numpy as np
 import pytest
 
@@ -18,6 +21,8 @@ HEIGHT = 0.04
 LIGHT = Light(np.array([-0.006, 0.002, 0.0]), 0.05, (0.2, 0.0), HEIGHT)
 CAMERA = make_camera("none", (200.0, 200.0, 79.5, 59.5), (), (160, 120))
 FISHEYE = make_camera("equidistant", (110.0, 110.0, 79.5, 59.5), (0.0, 0.0, 0.0, 0.0), (160, 120))
+CLOSE_UP = make_camera("none", (750.0, 750.0, 159.5, 119.5), (), (320, 240))
+"""A pixel is 0.05 mm."""
 BRIGHT, DARK, GREY = 0.9, 0.3, 180.0
 SPACING = 2e-4
 
@@ -39,13 +44,15 @@ def stripes(xy: FloatArray) -> FloatArray:
     return np.where(np.floor(xy[:, 0] / 0.004) % 2 == 0, BRIGHT, DARK)
 
 
-def picture(T_map_camera: FloatArray, camera: CameraModel = CAMERA, colour: bool = True) -> ByteArray:
-    """Return what a camera sees of the plane under the light on board."""
+def picture(
+    T_map_camera: FloatArray, camera: CameraModel = CAMERA, colour: bool = True, rho: Callable[[FloatArray], FloatArray] = stripes
+) -> ByteArray:
+    """Return what a camera sees of the plane, of an albedo ``rho``, under the light on board."""
     v, u = np.mgrid[: camera.height, : camera.width]
     rays = np.column_stack([camera.unproject(np.column_stack([u.ravel(), v.ravel()]).astype(np.float64)), np.ones(u.size)])
     turned = rays @ T_map_camera[:3, :3].T
     local = rays * (-T_map_camera[2, 3] / turned[:, 2])[:, None]
-    grey = GREY * stripes((local @ T_map_camera[:3, :3].T + T_map_camera[:3, 3])[:, :2]) * shading(local, T_map_camera)
+    grey = GREY * rho((local @ T_map_camera[:3, :3].T + T_map_camera[:3, 3])[:, :2]) * shading(local, T_map_camera)
     plain = np.clip(np.rint(grey), 0, 255).astype(np.uint8).reshape(v.shape)
     return np.stack([plain // 2, plain, plain], axis=2) if colour else plain
 
@@ -134,6 +141,61 @@ def test_print_keeps_its_contrast_where_photographs_agree() -> None:
     found, clear = albedo(point_map, LIGHT)[:, 0], within(points)
     dark = stripes(points) == DARK
     assert found[clear & dark].mean() < 1.1 * DARK / BRIGHT * found[clear & ~dark].mean()
+
+
+def strokes(width: float) -> Callable[[FloatArray], FloatArray]:
+    """Return the albedo of places (N, 2): bright, but for dark strokes 1.5 mm apart, crossed by one."""
+
+    def rho(xy: FloatArray) -> FloatArray:
+        along, across = (xy[:, 0] + 7.5e-4) % 1.5e-3 - 7.5e-4, xy[:, 1]
+        return np.where((np.abs(along) < width / 2) | (np.abs(across) < width / 2), DARK, BRIGHT)
+
+    return rho
+
+
+def misregistered(rho: Callable[[FloatArray], FloatArray]) -> list[Photograph]:
+    """Return photographs as they are in a scan: blurred, noisy, and each off by a pixel and a half to its own side."""
+    rng, off = np.random.default_rng(3), 1.5 * HEIGHT / CLOSE_UP.fx
+    result = []
+    for number, (x, y) in enumerate([(-0.002, -0.001), (0.0, 0.0), (0.003, 0.001), (0.001, -0.002), (-0.001, 0.002)]):
+        T = looking_down(x, y)
+        blurred = cv2.GaussianBlur(picture(T, CLOSE_UP, rho=rho).astype(np.float32), (0, 0), 1.0)
+        pixels = np.clip(np.rint(blurred + rng.normal(0.0, 2.0, blurred.shape)), 0, 255).astype(np.uint8)
+        believed, angle = T.copy(), 2 * np.pi * number / 5
+        believed[:2, 3] += off * np.array([np.cos(angle), np.sin(angle)])
+        result.append(Photograph.of(pixels, believed, HEIGHT))
+    return result
+
+
+def scattered() -> tuple[PointMap, FloatArray]:
+    """Return a map of a part of the plane that most photographs show, and its points (N, 3), not on the grid of the print."""
+    points = plane(0.004)
+    points[:, :2] += np.random.default_rng(5).uniform(-0.5, 0.5, (len(points), 2)) * SPACING
+    point_map = mapped(points)
+    return point_map, point_map.columns.position[: point_map.rows]
+
+
+@pytest.mark.parametrize("width", [3e-4, 4e-4, 5e-4])
+def test_dark_strokes_keep_their_contrast_where_photographs_are_off_by_a_pixel(width: float) -> None:
+    point_map, points = scattered()
+    develop(point_map, LIGHT, CLOSE_UP, misregistered(strokes(width)))
+    dark, bright = strokes(width)(points[:, :2]) == DARK, strokes(width + 3e-4)(points[:, :2]) == BRIGHT
+    by_photographs, found = point_map.columns.albedo[: len(points), 0], albedo(point_map, LIGHT)[:, 0]
+    assert np.isfinite(found).all()
+    shown = by_photographs[bright].mean() - by_photographs[dark].mean()
+    assert shown > 0.5 * GREY * (BRIGHT - DARK)
+    assert found[bright].mean() - found[dark].mean() > 0.9 * shown
+
+
+def test_a_strip_of_wrong_normals_takes_the_level_around() -> None:
+    point_map, points = scattered()
+    strip = np.abs(points[:, 1] - 0.0015) < 5e-4
+    point_map.columns.normal[: len(points)][strip] = [np.sin(np.radians(60.0)), 0.0, np.cos(np.radians(60.0))]
+    develop(point_map, LIGHT, CLOSE_UP, misregistered(strokes(0.0)))
+    by_photographs, found = point_map.columns.albedo[: len(points), 0], albedo(point_map, LIGHT)[:, 0]
+    middle = np.abs(points[:, 1] - 0.0015) < 3e-4
+    assert by_photographs[middle].mean() > 2.0 * GREY * BRIGHT
+    assert found[middle].mean() < 1.3 * GREY * BRIGHT
 
 
 def test_a_wrong_normal_is_told_by_photographs_that_do_not_agree() -> None:
