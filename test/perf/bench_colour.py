@@ -6,7 +6,9 @@ A RECORDING has ``bag``, ``calibration.yaml``, ``truth.tum``, ``passes.json``, `
 ``vli simulate`` writes them. Each pass makes a map of its own; light and lens are those found by the whole scan. Lines: colours
 as in the images, each point corrected by itself, the same with the normals of the surface, and as ``vli run`` writes them.
 Figures are RMS of 255: points of the two passes that lie within 0.15 mm of each other, means of such pairs over 0.5 mm, the
-pairs by the angle at which the light falls on the true surface; and map points against albedo after one gain a channel.
+pairs by the angle at which the light falls on the true surface; and map points against albedo after one gain a channel. Print is
+points of flat places whose true grey level differs by 20 or more from the mean within 0.75 mm; its contrast is the slope of the
+shown differences over the true ones, 1 where all of it is kept.
 """
 
 from __future__ import annotations
@@ -35,6 +37,7 @@ from vli_mapping.warm_up import warm_up
 ERROR_M = 3e-5
 """RMS of the slow error of the poses: without any, a map is better than it ever is."""
 PAIR_M, SPOT_M, ALBEDO_M = 1.5e-4, 5e-4, 2e-4
+PRINT_M, PRINT_LEVEL, FLAT = 7.5e-4, 20.0, float(np.cos(np.radians(15.0)))
 ANGLES_DEG = (0.0, 20.0, 40.0, 60.0, 90.0)
 
 
@@ -74,8 +77,19 @@ class Pass:
         """Return the RMS against the albedo, of 255, after the best gain of each channel."""
         known = np.isfinite(self.albedo).all(axis=1) & np.isfinite(colours).all(axis=1)
         shown, true = colours[known], self.albedo[known]
-        gain = (shown * true).sum(axis=0) / (shown**2).sum(axis=0)
-        return rms(gain * shown - true)
+        return rms(best_gain(shown, true) * shown - true)
+
+    def print_contrast(self, colours: FloatArray) -> float:
+        """Return how much of the contrast of print (1 = all) the colours keep, after the best gain of each channel."""
+        known = np.isfinite(self.albedo).all(axis=1) & np.isfinite(colours).all(axis=1)
+        position, normals, shown, true = self.position[known], self.normals[known], colours[known], self.albedo[known]
+        pairs = KDTree(position).query_pairs(PRINT_M, output_type="ndarray")
+        bent = np.einsum("ni,ni->n", normals[pairs[:, 0]], normals[pairs[:, 1]]) < FLAT
+        is_flat = np.ones(len(position), np.bool_)
+        is_flat[pairs[bent].ravel()] = False
+        of_true, of_shown = (details(item.mean(axis=1), pairs) for item in (true, best_gain(shown, true) * shown))
+        is_print = is_flat & (np.abs(of_true) >= PRINT_LEVEL)
+        return float((of_shown * of_true)[is_print].sum() / (of_true[is_print] ** 2).sum()) if is_print.any() else np.nan
 
 
 def true_albedo(seen: Path, position: FloatArray) -> FloatArray:
@@ -84,6 +98,20 @@ def true_albedo(seen: Path, position: FloatArray) -> FloatArray:
     known = np.stack([vertex[f"albedo_{name}"] for name in ("red", "green", "blue")], axis=1).astype(np.float64)
     distance, nearest = KDTree(np.stack([vertex[name] for name in "xyz"], axis=1)).query(position)
     return np.where((distance < ALBEDO_M)[:, None], known[nearest], np.nan)
+
+
+def best_gain(shown: FloatArray, true: FloatArray) -> FloatArray:
+    """Return the factors (3,) by which shown colours (N, 3) come nearest to the true ones."""
+    result: FloatArray = (shown * true).sum(axis=0) / (shown**2).sum(axis=0)
+    return result
+
+
+def details(grey: FloatArray, pairs: IntArray) -> FloatArray:
+    """Return by how much grey levels (N,) differ from the means over their neighbours; ``pairs`` (M, 2) of these, each once."""
+    first, second = np.concatenate([pairs, pairs[:, ::-1]]).T
+    count = 1 + np.bincount(first, minlength=len(grey))
+    result: FloatArray = grey - (grey + np.bincount(first, grey[second], len(grey))) / count
+    return result
 
 
 def rms(values: FloatArray) -> float:
@@ -108,9 +136,11 @@ def print_line(name: str, passes: tuple[Pass, Pass], pairs: tuple[IntArray, IntA
     angle = np.maximum(passes[0].angle_deg[pairs[0]], passes[1].angle_deg[pairs[1]])
     by_angle = [rms(difference[(angle >= low) & (angle < high)]) for low, high in itertools.pairwise(ANGLES_DEG)]
     to_albedo = np.mean([item.error_to_albedo(colour) for item, colour in zip(passes, shown, strict=True)])
+    contrast = np.mean([item.print_contrast(colour) for item, colour in zip(passes, shown, strict=True)])
     print(
         f"{name:24s} pairs {rms(difference):5.1f} (median {np.nanmedian(np.abs(difference)):.1f}), spots {rms(spots):5.1f}; "
-        f"by angle {', '.join(f'{value:.1f}' for value in by_angle)}; to albedo {to_albedo:.1f}",
+        f"by angle {', '.join(f'{value:.1f}' for value in by_angle)}; to albedo {to_albedo:.1f}; "
+        f"contrast of print {contrast:.2f}",
         flush=True,
     )
 

@@ -89,8 +89,9 @@ def albedo(point_map: PointMap, light: Light) -> Float32Array:
     for start in range(0, len(which), _CHUNK):
         part = slice(start, start + _CHUNK)
         views.fill(part, point_map, light, which[part], normals[part])
-    rough = _ROUGH * (~c.normal[which].any(axis=1)).astype(np.float32) + _ROUGH * ~c.solid[which]
-    return around.blend(normals, views, 1.0 / agreement**2 - 1.0, rough + _SHADOWED * views.shadowed)
+    rough = (~c.normal[which].any(axis=1)).astype(np.float32) + ~c.solid[which]
+    doubt = _ROUGH * rough + _SHADOWED * views.shadowed.astype(np.float32)
+    return around.blend(normals, views, 1.0 / agreement**2 - 1.0, doubt)
 
 
 def mean_normals(point_map: PointMap, which: IntArray) -> Float32Array:

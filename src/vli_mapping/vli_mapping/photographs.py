@@ -112,9 +112,9 @@ def develop(point_map: PointMap, light: Light | None, camera: CameraModel, photo
     position, normals = c.position[which], mean_normals(point_map, which)
     weight, power = c.albedo_weight[which].astype(np.float64), c.albedo_power[which].astype(np.float64)
     total = c.albedo[which] * weight[:, None]
-    blocks = _Blocks(position)
+    blocks = _Blocks(position, camera)
     for photograph in photographs:
-        rows, local = blocks.before(camera, photograph)
+        rows, local = blocks.before(photograph)
         colours, seen = sample_colours(camera, local, photograph.pixels())
         turned = normals[rows] @ photograph.T_map_camera[:3, :3]
         seen &= facing(local, turned.astype(np.float32), _MOST_INCIDENCE_DEG)
@@ -128,24 +128,25 @@ def develop(point_map: PointMap, light: Light | None, camera: CameraModel, photo
 
 
 class _Blocks:
-    """Points (N, 3), in blocks of which a photograph leaves most out without a look at each point."""
+    """Points (N, 3) before a camera, in blocks of which a photograph leaves most out without a look at each point."""
 
-    def __init__(self, points: FloatArray) -> None:
+    def __init__(self, points: FloatArray, camera: CameraModel) -> None:
         self._points = points
+        self._corner = float(np.hypot(*np.nanmax(np.abs(camera.unproject(camera.pixel_grid(2))), axis=0)))
         cells = np.floor(points / _BLOCK_M).astype(np.int64)
         self._order = np.lexsort(cells.T)
         change = np.diff(cells[self._order], axis=0, prepend=cells[self._order[:1]] - 1).any(axis=1)
         self._starts = np.flatnonzero(change)
         self._centres = _BLOCK_M * (cells[self._order[self._starts]] + 0.5).astype(np.float64)
 
-    def before(self, camera: CameraModel, photograph: Photograph) -> tuple[IntArray, FloatArray]:
+    def before(self, photograph: Photograph) -> tuple[IntArray, FloatArray]:
         """Return which points (K,) may be in a photograph, and these points (K, 3) in its camera frame."""
         T_camera_map = inverse(photograph.T_map_camera)
         radius = np.sqrt(0.75) * _BLOCK_M
-        near = _in_field(camera, transform(T_camera_map, self._centres), radius, _REACH * photograph.depth)
+        near = _in_field(self._corner, transform(T_camera_map, self._centres), radius, _REACH * photograph.depth)
         rows = np.concatenate([np.empty(0, np.int64), *self._members(near)])
         local = transform(T_camera_map, self._points[rows])
-        inside = _in_field(camera, local, 0.0, _REACH * photograph.depth)
+        inside = _in_field(self._corner, local, 0.0, _REACH * photograph.depth)
         return rows[inside], local[inside]
 
     def _members(self, near: BoolArray) -> Iterator[IntArray]:
@@ -153,9 +154,14 @@ class _Blocks:
         return (self._order[self._starts[block] : ends[block]] for block in np.flatnonzero(near))
 
 
-def _in_field(camera: CameraModel, points: FloatArray, radius: float, reach: float) -> BoolArray:
-    """Return which balls of ``radius`` about points (N, 3), camera frame, touch the cone around the field of view."""
-    corner = np.hypot(*np.nanmax(np.abs(camera.unproject(camera.pixel_grid(2))), axis=0))
+def _in_field(corner: float, points: FloatArray, radius: float, reach: float) -> BoolArray:
+    """Return which balls of ``radius`` about points (N, 3), camera frame, touch the cone around the field of view.
+
+    Args:
+        corner: tangent of its half angle.
+        points, radius: metres.
+        reach: along the axis, metres.
+    """
     across, z = np.hypot(points[:, 0], points[:, 1]), points[:, 2]
     result: BoolArray = (across - corner * z < radius * np.hypot(1.0, corner)) & (z > -radius) & (z < reach + radius)
     return result
