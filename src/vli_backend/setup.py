@@ -21,6 +21,7 @@ setup(
         "gtsam>=4.3",
         "numba>=0.59",
         "numpy>=1.26",
+        "opencv-python-headless>=4.6,<5",
     ],
     zip_safe=False,
     entry_points={

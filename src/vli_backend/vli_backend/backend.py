@@ -82,7 +82,7 @@ class BackEnd:
         self._laser_check = LaserCheck(calibration, config, mode)
         self._inertial_scale = InertialScale.of_scene(calibration, config)
         self._reckoning, self._placement = DeadReckoning(), Placement()
-        self._last_scan_ns, self._last_imu_ns, self._last_good_ns, self._last_frame_ns = 0, 0, 0, 0
+        self._last_scan_ns, self._last_imu_ns, self._last_good_ns, self._last_frame_ns, self._unseen_ns = 0, 0, 0, 0, 0
         self._last_failure_ns, self._placed_ns = -_RECOVERY_NS, -1
         self._longest_unseen_ns = max(_NO_IMAGE[0], int(_NO_IMAGE[1] * NANOSECONDS / calibration.rate_hz))
 
@@ -166,28 +166,35 @@ class BackEnd:
             return BackEndOutput(stamp, self.state, self.reason)
         self._estimator, self._lost_by = estimator, ""
         self.counters.add("starts")
-        self._placement.guess(self._reckoning.sigma_m(stamp))
+        self._placement.guess(self._reckoning.sigma_m)
         self.state, self.reason = TrackingState.TRACKING, self._starter.reason
         if not self._placement.is_located:
             self.reason += f", {self._reckoning.elapsed_s(stamp):.1f} s after the loss"
+        self._reckoning = DeadReckoning(*estimator.newest)
         self._last_good_ns = self._last_frame_ns = stamp
+        self._unseen_ns = 0
         return self._output(stamp, estimator.current(stamp, self.session))
 
     def _track(self, frame: FrontEndOutput, estimator: WindowEstimator) -> BackEndOutput:
         stamp = frame.tracks.stamp_ns
-        unseen_ns, self._last_frame_ns = stamp - self._last_frame_ns, stamp
+        self._unseen_ns, self._last_frame_ns = stamp - self._last_frame_ns, stamp
+        # Before the solve: where that fails, this is how the frame came here.
+        self._reckoning.add_frame(frame)
         result = estimator.add_frame(frame, self.session)
         self.counters.add("keyframes", int(frame.tracks.keyframe))
         carrier = "the IMU carries it" if frame.preintegration is not None else "nothing carries it"
         if result.landmarks >= self._config.min_landmarks:
             self._last_good_ns = stamp
+            if frame.tracks.keyframe:
+                self._reckoning = DeadReckoning(*estimator.newest)
             self._check_scale(frame, result, estimator)
             self.state, self.reason = TrackingState.TRACKING, self._hint(stamp)
             if result.problem:
                 self.counters.add("solver_rescues")
                 self.state, self.reason = TrackingState.DEGRADED, f"solver failed, the keyframe is held weakly: {result.problem}"
-            if unseen_ns > self._longest_unseen_ns:
-                self.state, self.reason = TrackingState.DEGRADED, f"no image for {unseen_ns / NANOSECONDS:.1f} s: {carrier}"
+            if self._was_blind:
+                self.state = TrackingState.DEGRADED
+                self.reason = f"no image for {self._unseen_ns / NANOSECONDS:.1f} s: {carrier}"
             return self._output(stamp, result)
         blind_s = (stamp - self._last_good_ns) / NANOSECONDS
         self.state = TrackingState.DEGRADED
@@ -195,9 +202,14 @@ class BackEnd:
             f"{result.landmarks} features match the window, {self._config.min_landmarks} are needed: "
             f"{carrier} for {blind_s:.1f} s"
         )
-        if blind_s > self._config.lost_after_s:
+        if blind_s > self._config.lost_after_s or (self._was_blind and frame.preintegration is None):
             return self._lose(stamp, f"too few features for {blind_s:.1f} s: covered lens, darkness or fast motion")
         return self._output(stamp, result)
+
+    @property
+    def _was_blind(self) -> bool:
+        """Whether the newest frame came after a gap between images."""
+        return self._unseen_ns > self._longest_unseen_ns
 
     def _check_scale(self, frame: FrontEndOutput, result: FrameResult, estimator: WindowEstimator) -> None:
         """Compare the scale with the IMU's: with the laser to watch over its plane, without it to sharpen the scale itself."""
@@ -231,9 +243,12 @@ class BackEnd:
         return BackEndOutput(stamp_ns, self.state, reason, window=window)
 
     def _recover(self, frame: FrontEndOutput, problem: str) -> BackEndOutput:
-        """After a solver's failure go on with a new window from the newest keyframe; LOST where that fails again at once."""
+        """After a solver's failure go on with a new window from the newest keyframe; LOST where that fails again at once.
+
+        Also where the keyframe came after a gap between images: it is only where it was predicted.
+        """
         estimator, stamp_ns = self._estimator, frame.tracks.stamp_ns
-        if estimator is None or stamp_ns - self._last_failure_ns < _RECOVERY_NS:
+        if estimator is None or self._was_blind or stamp_ns - self._last_failure_ns < _RECOVERY_NS:
             return self._lose(stamp_ns, f"solver failed: {problem}")
         self._last_failure_ns = stamp_ns
         tracks, state = estimator.restart
@@ -259,7 +274,6 @@ class BackEnd:
         window = None
         if estimator is not None:
             window = estimator.flush(self.session)
-            self._reckoning = DeadReckoning(*estimator.newest)
         self.state, self.reason = state, reason
         self._lost_by = reason if state is TrackingState.LOST else ""
         self._wait_for_start()

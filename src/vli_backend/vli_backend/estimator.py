@@ -11,7 +11,7 @@ import numpy as np
 from vli_backend.condense import Quadratic, condense, refine
 from vli_backend.config import BackEndConfig
 from vli_backend.depth_prior import DepthPrior
-from vli_backend.frame_pose import FramePose, solve_frame_pose
+from vli_backend.frame_pose import FramePose, pose_by_features, solve_frame_pose
 from vli_backend.landmarks import LandmarkPoints, LandmarkTable
 from vli_backend.laser_depth import measure_slot
 from vli_backend.map_residuals import condense_map
@@ -164,6 +164,7 @@ class WindowEstimator:
         tracks, imu = frame.tracks, self._usable(frame.preintegration)
         inflate = frame.preintegration.inflate if frame.preintegration is not None else 1.0
         predicted = self._predictor.predict(tracks.stamp_ns, imu, tracks.stationary, inflate)
+        self._largest_jump = self._depths.near + predicted.reach_m
         found = self._frame_pose(tracks, predicted)
         self._predictor.observe(tracks.stamp_ns, found.T_map_camera)
         self._restarted.update(int(i) for i in tracks.ids[(tracks.flags & TrackFlag.TEMPLATE) > 0])
@@ -221,12 +222,14 @@ class WindowEstimator:
 
     def _frame_pose(self, tracks: Tracks, predicted: Prediction) -> FramePose:
         _, rows, columns = np.intersect1d(self._points.ids, tracks.ids, assume_unique=True, return_indices=True)
+        points, rays = self._points.positions[rows], tracks.rays[columns]
+        start = pose_by_features(points, rays, self._camera.focal_px) if predicted.reach_m else None
         found = solve_frame_pose(
-            predicted.T_map_camera,
+            predicted.T_map_camera if start is None else start,
             predicted.information,
-            self._points.positions[rows],
+            points,
             self._points.spread[rows],
-            tracks.rays[columns],
+            rays,
             whitening(self._camera, tracks, self._config.pixel_sigma)[columns],
             self._config.cauchy,
         )

@@ -8,14 +8,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numba
 import numpy as np
 
 from vli_backend.rotations import exp, log
 from vli_common.arrays import FloatArray
+from vli_common.geometry import inverse, pose, so3_exp
 
 _INLIER_SQUARED = 18.0
 """Squared residual (2 dof, in sigmas) up to which a landmark counts as matched; the robust loss weighs it anyway."""
+_ALONE_PX, _ALONE_ROUNDS, _ALONE_CONFIDENCE, _LEAST_ALONE = 3.0, 200, 0.999, 12
+"""RANSAC without a prediction: error of an inlier, samples, confidence, inliers."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +103,34 @@ def _solve(rotation, translation, points, weights, rays, prior, cauchy, iteratio
     # One Newton step of the polar decomposition: poses are chained from frame to frame, and rounding errors would grow.
     rotation = rotation @ (1.5 * np.eye(3) - 0.5 * rotation.T @ rotation)
     return rotation, translation, h, inliers, squares, done
+
+
+def pose_by_features(points: FloatArray, rays: FloatArray, focal_px: float) -> FloatArray | None:
+    """Return ``T_map_camera`` (4, 4) by the features alone (RANSAC), for where a prediction may be too far off to start from.
+
+    Args:
+        points: (N, 3) landmarks in map.
+        rays: (N, 2) observed.
+        focal_px: pixels a unit of rays.
+
+    Returns:
+        None where too few of them agree.
+    """
+    if len(points) < _LEAST_ALONE:
+        return None
+    found, turn, shift, inliers = cv2.solvePnPRansac(
+        points,
+        rays,
+        np.eye(3),
+        None,
+        iterationsCount=_ALONE_ROUNDS,
+        reprojectionError=_ALONE_PX / focal_px,
+        confidence=_ALONE_CONFIDENCE,
+        flags=cv2.SOLVEPNP_SQPNP,
+    )
+    if not found or inliers is None or len(inliers) < _LEAST_ALONE:
+        return None
+    return inverse(pose(so3_exp(turn.ravel().astype(np.float64)), shift.ravel().astype(np.float64)))
 
 
 def solve_frame_pose(

@@ -32,6 +32,9 @@ one side and the patch the other, betrays itself by the residual of its patch: w
 off at twice the range on stepped scenes, with the better half 0.5 % at most."""
 _CERTAIN = 5.0
 _CERTAIN_SCALE = 4.0
+_PLAUSIBLE_SCALE = 0.3
+"""A path that seems to be more than so much longer or shorter tells of a motion too even for the IMU, not of the plane: one that
+has moved that far betrays itself by the structure."""
 _SCALE_FLOOR = 0.003
 """Of a relative scale: what a whole scan leaves open, however long."""
 _CAUCHY = 2.0
@@ -67,6 +70,8 @@ class LaserPlaneMonitor:
 
     def add_scale(self, scale: float, sigma: float) -> None:
         """Take how long a piece of path is by the IMU over how long it is by the laser, and its relative sigma."""
+        if abs(scale - 1.0) > _PLAUSIBLE_SCALE:
+            return
         weight = 1.0 / sigma**2
         self._weight, self._weighted = self._weight + weight, self._weighted + weight * (scale - 1.0)
         self._judge()

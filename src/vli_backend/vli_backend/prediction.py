@@ -15,7 +15,12 @@ _REST = (2e-4, 1e-4)
 _IMU = (5e-4, 2e-4)
 _IMU_GROWTH = (2e-3, 2e-2)
 _NO_IMU = (0.02, 2e-3)
-"""Sigmas (rad, m) of a prediction: at rest; with IMU, at once and per second; without IMU. Loose against what features say."""
+"""Sigmas (rad, m) of a prediction: at rest; with IMU, at once and per second; without, per period. Loose against features."""
+
+_REACH_SIGMAS, _HAND_SPEED = 3.0, 1.0
+"""How far off a prediction across a gap may be: in its sigmas, and at most by what a hand does, m/s."""
+_BLIND_S = 0.15
+"""Without an image for so long a prediction may be anywhere; over less, the small motion of a hand keeps it near."""
 
 
 @dataclass(frozen=True)
@@ -25,6 +30,8 @@ class Prediction:
     T_map_camera: FloatArray
     velocity: FloatArray
     information: FloatArray
+    reach_m: float = 0.0
+    """How much farther off than a hand moves between two frames the prediction may be: it leads across a gap."""
 
 
 class Predictor:
@@ -89,8 +96,9 @@ class Predictor:
             return replace(self._without_imu(stamp_ns, stationary), velocity=nav.velocity())
         elapsed = (stamp_ns - last_ns) * 1e-9
         predicted = orthonormalised(last @ inverse(self._T_imu_cam) @ step @ self._T_imu_cam)
-        sigmas = ((s + growth * elapsed) * inflate**0.5 for s, growth in zip(_IMU, _IMU_GROWTH, strict=True))
-        return Prediction(predicted, nav.velocity(), _information(*sigmas))
+        rotation, position = ((s + growth * elapsed) * inflate**0.5 for s, growth in zip(_IMU, _IMU_GROWTH, strict=True))
+        reach = _reach(position, elapsed) if inflate > 1.0 else 0.0
+        return Prediction(predicted, nav.velocity(), _information(rotation, position), reach)
 
     def _without_imu(self, stamp_ns: int, stationary: bool) -> Prediction:
         last_ns, last = self._frames[-1]
@@ -107,7 +115,13 @@ class Predictor:
         predicted = last.copy()
         predicted[:3, :3] = last[:3, :3] @ so3_exp(ahead * turn)
         predicted[:3, 3] += velocity * ahead * between
-        return Prediction(predicted, velocity, _information(*_NO_IMU))
+        missed = max(elapsed / between, 1.0)
+        rotation, position = (missed * sigma for sigma in _NO_IMU)
+        return Prediction(predicted, velocity, _information(rotation, position), _reach(position, elapsed))
+
+
+def _reach(sigma_m: float, elapsed_s: float) -> float:
+    return min(_REACH_SIGMAS * sigma_m, _HAND_SPEED * elapsed_s) if elapsed_s > _BLIND_S else 0.0
 
 
 def _information(rotation: float, position: float) -> FloatArray:

@@ -17,6 +17,9 @@ from vli_common.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArr
 from vli_common.geometry import interpolate, inverse
 from vli_common.types import FrameKind, LaserScan, WindowPoses
 
+_LONGEST_NS = 150_000_000
+"""Between long frames farther apart nothing tells the motion of the short ones: a hand trembles at 4 to 12 Hz."""
+
 
 @dataclass(frozen=True)
 class Interval:
@@ -54,17 +57,17 @@ class FrameRecord:
     stationary: bool
 
 
-def close_interval(frames: list[FrameRecord], scans: list[LaserScan]) -> Interval:
+def close_interval(frames: list[FrameRecord], scans: list[LaserScan], longest_ns: int = _LONGEST_NS) -> Interval:
     """Return the interval between ``frames[0]`` and ``frames[-1]`` (the keyframes), with the scans taken in it.
 
-    Short frames get the pose that the long frames around them tell.
+    Short frames get the pose that the long frames around them tell; where these are farther apart than ``longest_ns``, they are
+    left out.
     """
     start, end = frames[0], frames[-1]
     inner = frames[1:-1]
-    scans = [scan for scan in scans if start.stamp_ns < scan.stamp_ns < end.stamp_ns]
     stamps = np.array([f.stamp_ns for f in frames], dtype=np.int64)
+    scans, before = _between(stamps, scans, longest_ns)
     scan_stamps = np.array([s.stamp_ns for s in scans], dtype=np.int64)
-    before = np.clip(np.searchsorted(stamps, scan_stamps, side="right") - 1, 0, len(frames) - 2)
     poses = np.stack([f.T_map_camera for f in frames])
     scan_poses = interpolate_path(stamps, poses, scan_stamps)
     rest = np.array([f.stationary for f in frames], np.bool_)
@@ -84,6 +87,14 @@ def close_interval(frames: list[FrameRecord], scans: list[LaserScan]) -> Interva
         inverse(interpolated) @ all_poses,
         {scan.stamp_ns: scan for scan in scans},
     )
+
+
+def _between(stamps: IntArray, scans: list[LaserScan], longest_ns: int) -> tuple[list[LaserScan], IntArray]:
+    """Return the scans taken between long frames (K,) that are near enough, and the index (M,) of the one before each."""
+    taken = np.array([scan.stamp_ns for scan in scans], dtype=np.int64)
+    before = np.clip(np.searchsorted(stamps, taken, side="right") - 1, 0, len(stamps) - 2)
+    told = (taken > stamps[0]) & (taken < stamps[-1]) & (stamps[before + 1] - stamps[before] <= longest_ns)
+    return [scan for scan, is_told in zip(scans, told, strict=True) if is_told], before[told]
 
 
 class Window:

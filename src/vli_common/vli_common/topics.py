@@ -79,6 +79,7 @@ class Topic:
         transient_local: True where a late subscriber gets the last message.
         sources, targets: executables; ``anyone`` is the world outside.
         fields: layout of a cloud, or None.
+        kept: what a publisher keeps for a reader that stands still, where that is more than the depth.
     """
 
     name: str
@@ -88,6 +89,7 @@ class Topic:
     targets: tuple[str, ...]
     transient_local: bool = False
     fields: np.dtype[np.void] | None = None
+    kept: int = 0
 
 
 _NODES = ("driver_node", "demux_node", "frontend_node", "backend_node", "mapping_node")
@@ -95,20 +97,28 @@ _CLOUD = "sensor_msgs/msg/PointCloud2"
 
 CALIBRATION = Topic("calibration", "std_msgs/msg/String", 1, ("driver_node",), _NODES[1:], transient_local=True)
 SESSION = Topic("session", "std_msgs/msg/Header", 1, _NODES, _NODES, transient_local=True)
-IMAGE_LONG = Topic("image_long", "sensor_msgs/msg/Image", 5, ("demux_node",), ("frontend_node", "mapping_node"))
+IMAGE_LONG = Topic("image_long", "sensor_msgs/msg/Image", 5, ("demux_node",), ("frontend_node", "mapping_node"), kept=45)
 IMAGE_SHORT = Topic("image_short", "sensor_msgs/msg/Image", 2, ("demux_node",), ("anyone",))
 LASER_POINTS = Topic(
-    "laser_points", _CLOUD, 10, ("demux_node",), ("frontend_node", "backend_node", "mapping_node"), fields=LASER_POINTS_FIELDS
+    "laser_points",
+    _CLOUD,
+    10,
+    ("demux_node",),
+    ("frontend_node", "backend_node", "mapping_node"),
+    fields=LASER_POINTS_FIELDS,
+    kept=60,
 )
-TRACKS = Topic("tracks", _CLOUD, 10, ("frontend_node",), ("backend_node",), fields=TRACKS_FIELDS)
-PREINTEGRATION = Topic("preintegration", _CLOUD, 10, ("frontend_node",), ("backend_node",), fields=preintegration_fields(0))
+TRACKS = Topic("tracks", _CLOUD, 10, ("frontend_node",), ("backend_node",), fields=TRACKS_FIELDS, kept=60)
+PREINTEGRATION = Topic(
+    "preintegration", _CLOUD, 10, ("frontend_node",), ("backend_node",), fields=preintegration_fields(0), kept=60
+)
 BIAS = Topic("bias", "geometry_msgs/msg/TwistStamped", 1, ("backend_node",), ("frontend_node",), transient_local=True)
 ODOMETRY = Topic("odometry", "nav_msgs/msg/Odometry", 10, ("backend_node",), ("frontend_node", "anyone"))
 POSE = Topic("pose", "geometry_msgs/msg/PoseStamped", 10, ("backend_node",), ("anyone",))
 PATH = Topic("path", "nav_msgs/msg/Path", 10, ("backend_node",), ("anyone",))
 TF = Topic("/tf", "tf2_msgs/msg/TFMessage", 10, ("backend_node",), ("anyone",))
 TF_STATIC = Topic("/tf_static", "tf2_msgs/msg/TFMessage", 10, ("backend_node",), ("anyone",), transient_local=True)
-WINDOW = Topic("window", _CLOUD, 5, ("backend_node",), ("mapping_node",), fields=WINDOW_FIELDS)
+WINDOW = Topic("window", _CLOUD, 5, ("backend_node",), ("mapping_node",), fields=WINDOW_FIELDS, kept=30)
 MAP_CONSTRAINTS = Topic("map_constraints", _CLOUD, 2, ("mapping_node",), ("backend_node",), fields=MAP_CONSTRAINTS_FIELDS)
 RELOCALISATION = Topic("relocalisation", "geometry_msgs/msg/PoseWithCovarianceStamped", 1, ("mapping_node",), ("backend_node",))
 CLOUD = Topic("cloud", _CLOUD, 5, ("mapping_node",), ("anyone",), fields=CLOUD_FIELDS)
@@ -117,12 +127,12 @@ MAP_UPDATE = Topic("map_update", _CLOUD, 5, ("mapping_node",), ("anyone",), fiel
 STATUS = Topic("status", "diagnostic_msgs/msg/DiagnosticArray", 10, _NODES, ("anyone",))
 DIAGNOSTICS = Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", 10, _NODES, ("anyone",))
 
-IMAGE_RAW = Topic("/camera/image_raw", "sensor_msgs/msg/Image", 10, ("driver_node",), ("demux_node",))
+IMAGE_RAW = Topic("/camera/image_raw", "sensor_msgs/msg/Image", 10, ("driver_node",), ("demux_node",), kept=60)
 IMAGE_RAW_COMPRESSED = Topic(
-    "/camera/image_raw/compressed", "sensor_msgs/msg/CompressedImage", 30, ("driver_node",), ("demux_node",)
+    "/camera/image_raw/compressed", "sensor_msgs/msg/CompressedImage", 30, ("driver_node",), ("demux_node",), kept=120
 )
-EXPOSURE = Topic("/camera/exposure", "diagnostic_msgs/msg/DiagnosticArray", 30, ("driver_node",), ("demux_node",))
-IMU = Topic("/imu", "sensor_msgs/msg/Imu", 200, ("driver_node",), ("frontend_node",))
+EXPOSURE = Topic("/camera/exposure", "diagnostic_msgs/msg/DiagnosticArray", 30, ("driver_node",), ("demux_node",), kept=120)
+IMU = Topic("/imu", "sensor_msgs/msg/Imu", 200, ("driver_node",), ("frontend_node",), kept=2000)
 
 TOPICS: tuple[Topic, ...] = (
     CALIBRATION, SESSION, IMAGE_LONG, IMAGE_SHORT, LASER_POINTS, TRACKS, PREINTEGRATION, BIAS, ODOMETRY, POSE, PATH, TF,

@@ -18,6 +18,8 @@ from vli_frontend.photometry import Frame
 
 _MAX_SIGMA_PX = 2.0
 """A position that is worse is of no use, whatever its own estimate: keeps infinities out of the messages."""
+_BLIND_S = 0.15
+"""After so long without an image no small motion vouches for a track: what does not look like its patch is another point."""
 
 
 @dataclass(slots=True)
@@ -143,7 +145,15 @@ class Tracker:
         if self._config.klt.alignment:
             self._align(frame.grey)
         tracks.flow = (tracks.pixels - turned[ok]) / dt_s
+        if dt_s > _BLIND_S:
+            self._keep_proven()
         self._reject(dt_s, rotation)
+
+    def _keep_proven(self) -> None:
+        """Drop the tracks whose patch has just been taken anew: what they follow now may be what they followed before, or not."""
+        proven = (self.tracks.flags & TrackFlag.TEMPLATE) == 0
+        self._counters.add("tracks_lost", int((~proven).sum()))
+        self.tracks.keep(proven)
 
     def _turn(self, rays: FloatArray, pixels: FloatArray, rotation: FloatArray) -> FloatArray:
         """Return pixels (N, 2) after a rotation of the camera; where a ray leaves the front, as they were."""

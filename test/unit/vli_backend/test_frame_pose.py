@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vli_backend.frame_pose import solve_frame_pose
+from vli_backend.frame_pose import pose_by_features, solve_frame_pose
 from vli_common.arrays import FloatArray
 from vli_common.geometry import inverse, pose, so3_exp, so3_log, transform
 
@@ -79,3 +79,23 @@ def test_without_landmarks_the_prediction_stands() -> None:
     found = solve_frame_pose(T, np.eye(6), np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 2)), np.empty((0, 2, 2)), 1.0)
     np.testing.assert_allclose(found.T_map_camera, T, atol=1e-12)
     assert found.inliers == 0
+
+
+def test_features_alone_find_a_pose_that_nothing_predicts_in_spite_of_wrong_matches() -> None:
+    T, points, rays = _scene()
+    rng = np.random.default_rng(3)
+    rays = rays + rng.normal(scale=SIGMA, size=rays.shape)
+    rays[::2] += rng.uniform(0.05, 0.3, size=rays[::2].shape)
+    found = pose_by_features(points, rays, 360.0)
+    assert found is not None
+    metres, radians = _error(found, T)
+    assert metres < 1e-3
+    assert radians < 0.03
+
+
+@pytest.mark.parametrize("right", [0, 8])
+def test_features_that_do_not_agree_tell_no_pose(right) -> None:
+    _, points, rays = _scene()
+    rays[right:] = np.random.default_rng(4).uniform(-0.6, 0.6, size=rays[right:].shape)
+    assert pose_by_features(points, rays, 360.0) is None
+    assert pose_by_features(points[:8], rays[:8], 360.0) is None

@@ -86,6 +86,13 @@ def test_a_scale_that_the_imu_contradicts_again_and_again_is_told() -> None:
     assert "the IMU says" in monitor.hint
 
 
+def test_a_scale_that_no_plane_has_tells_of_a_motion_that_is_too_even_for_the_imu() -> None:
+    monitor = _monitor()
+    for scale in (1.8, 4.2, 3.5, 3.1, 0.4):
+        monitor.add_scale(scale, 0.08)
+    assert monitor.hint == ""
+
+
 def test_a_handful_of_landmarks_is_no_evidence() -> None:
     monitor = _monitor()
     monitor.add_residuals(_residuals(along=0.05, count=50))

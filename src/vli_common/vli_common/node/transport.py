@@ -89,13 +89,13 @@ def quality(topic: Topic, reading: bool = False) -> QoSProfile:
     """Return the quality of service of a topic: always RELIABLE, as a best-effort publisher never reaches a reliable reader.
 
     Args:
-        topic: of the table, whose depth is the publisher's.
+        topic: of the table; a publisher keeps its depth, or ``kept``.
         reading: True for a subscriber: it keeps more, since a callback may wait for the interpreter while a kernel runs, and a
             full reader loses even RELIABLE messages.
     """
-    keeps_more = reading and not topic.transient_local
+    factor = _READER_FACTOR if reading and not topic.transient_local else 1
     return QoSProfile(
-        depth=topic.depth * (_READER_FACTOR if keeps_more else 1),
+        depth=max(factor * topic.depth, topic.kept),
         history=HistoryPolicy.KEEP_LAST,
         reliability=ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if topic.transient_local else DurabilityPolicy.VOLATILE,
