@@ -44,6 +44,8 @@ _LEAST_MISFIT = 3e-4
 """It is the noise of the images that makes less."""
 _MISFIT_DOUBT, _CURVED_DOUBT = 200.0, 2.0
 """Doubt of a level, likewise; a level of doubt d keeps the share 1 / (1 + d)."""
+_UNLIT = 0.1
+"""Doubt of a neighbour that has been in the light of the reference once: nothing contradicts what a single view shows."""
 _MOST_GAIN = 4.0
 """Of the factor that draws a level, or the least as its inverse."""
 _LEAST_WEIGHT = 1e-3
@@ -195,7 +197,7 @@ class _Neighbourhood:
         _pool(self._around, self._points, normals, views.misfit, misfit)
         in_level = _MISFIT_DOUBT * misfit + _CURVED_DOUBT * scatter
         # As a neighbour, a point is asked for its colour, and there may be better ones: whatever it is that spoils it.
-        trust = 1.0 / (in_level + _MISFIT_DOUBT * views.misfit + doubt + _LEAST)
+        trust = 1.0 / (in_level + _MISFIT_DOUBT * views.misfit + _UNLIT / views.weight + doubt + _LEAST)
         error = _MISFIT * misfit + _CURVED * scatter
         shown = (views.colours, views.weight, views.shadowed)
         _blend(self._around, self._points, normals, shown, (in_level, doubt, trust, error), result)
