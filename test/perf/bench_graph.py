@@ -1,6 +1,6 @@
 """The node graph's figures against their bars: a table, no verdict.
 
-    python test/perf/bench_graph.py [--bag ../shared/data/keyboard_short] [--only latency rate overhead kill soak stop]
+    python test/perf/bench_graph.py [--bag ../shared/data/keyboard_short] [--only latency rate overhead hang kill soak stop]
                                     [--soak MINUTES] [--starts N] [--duration S]
 
 Times mean something on an idle machine only. ``--bag`` is a directory with ``bag``, ``calibration.yaml`` and, for the errors,
@@ -9,6 +9,7 @@ Times mean something on an idle machine only. ``--bag`` is a directory with ``ba
 latency   the bag at its own pace: what is lost, time from when a long frame was due to its pose, errors against `vli run`
 rate      the highest pace without a loss
 overhead  processor time of each node beyond that of its stage: transport, executor, copies; the driver's stage is reading the bag
+hang      nodes stand still (SIGSTOP), one or all, at random moments for up to 1.8 s: errors against the truth, what is lost
 kill      each node killed (SIGKILL) five times: time until it works again in the graph, the others alive
 soak      the bag again and again: growth of memory, latency of the first half and of the second
 stop      all nodes started and stopped, SIGINT and SIGTERM in turn, at random moments: exit codes, complaints, shared memory left
@@ -26,6 +27,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -33,20 +35,27 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from graph_bench import NODES, Graph, Meter, Recording, graph, resident_mb, rmse_mm, run_offline
+from graph_bench import NODES, Graph, Meter, Recording, graph, live, resident_mb, rmse_mm, run_offline
 
 from vli_bringup.cli import main as vli
 from vli_bringup.graph import describe_graph
+from vli_bringup.listener import GraphListener
 from vli_bringup.processes import GraphError
 from vli_bringup.tum import read_tum
 from vli_common.arrays import FloatArray
 from vli_common.node.shared_memory import remove_dead_segments
+from vli_common.status import NodeState
 from vli_common.stop_signals import held_back
 
 DATA = Path(__file__).resolve().parents[3] / "shared/data/keyboard_short"
 RATES = (1.0, 1.25, 1.5, 1.75, 2.0, 2.5, 3.0)
 KILLS = 5
 LINKED_S = 2.0
+HANGS = 6
+_HANG_EVERY_S = (0.05, 0.6)
+_HANG_S = (0.05, 0.2, 0.5, 1.0, 1.8)
+_ALL_HANG = 0.2
+"""Share of the hangs that are of the whole machine."""
 STOP_S = 2.0
 _SHARED_MEMORY = Path("/dev/shm")
 _SETTLED = 1.0 / 6.0
@@ -136,6 +145,23 @@ class Bench:
         measured = f"{machine:.0f} % of the machine, {100 * beyond / sum(used.values()):.0f} % of what the graph uses"
         self.table.add("transport in all", "≤ 25 % of CPU", measured)
 
+    def hang(self) -> None:
+        """Stop nodes at random and let them go on: what a busy machine, a disk or a debugger does."""
+        truth = self.recording.directory / "truth.tum"
+        for seed in range(HANGS):
+            with self.graph() as run:
+                run.wait_for_frames()
+                hangs = threading.Thread(target=_hang, args=(list(run.processes.pids.values()), seed, run.listener), daemon=True)
+                hangs.start()
+                run.play()
+                hangs.join()
+                losses, found = run.listener.losses(), live(run.recorder)
+                lost = sum(state == "LOST" for _, state, _ in run.recorder.states)
+            error = f"{rmse_mm(found, read_tum(truth)):.3f} mm, " if truth.exists() else ""
+            self.table.add(
+                f"hangs, seed {seed}: RMSE", "", f"{error}{len(found.stamps_ns)} poses, {lost} × LOST, lost: {_losses(losses)}"
+            )
+
     def kill(self) -> None:
         """Kill each node five times; the graph goes on."""
         times: dict[str, list[float]] = {name: [] for name in NODES}
@@ -203,6 +229,18 @@ class Bench:
         self.table.add(f"memory of {what}: mean, growth", "< 3 %", f"{sizes[settled].mean():.0f} MB, {100 * growth:+.1f} %")
 
 
+def _hang(pids: list[int], seed: int, listener: GraphListener) -> None:
+    """Stop one process, or all, again and again until the bag has been played."""
+    rng = random.Random(seed)
+    while listener.state("driver_node") is not NodeState.FINISHED:
+        time.sleep(rng.uniform(*_HANG_EVERY_S))
+        chosen = pids if rng.random() < _ALL_HANG else [rng.choice(pids)]
+        for sign, seconds in ((signal.SIGSTOP, rng.choice(_HANG_S)), (signal.SIGCONT, 0.0)):
+            for pid in chosen:
+                os.kill(pid, sign)
+            time.sleep(seconds)
+
+
 def _kill(run: Graph, name: str) -> float:
     """Return the seconds from the death of a node until it works in the graph again."""
     others = {other: pid for other, pid in run.processes.pids.items() if other != name}
@@ -247,6 +285,7 @@ SECTIONS: dict[str, Callable[[Bench], None]] = {
     "latency": Bench.latency,
     "rate": Bench.rate,
     "overhead": Bench.overhead,
+    "hang": Bench.hang,
     "kill": Bench.kill,
     "soak": Bench.soak,
     "stop": Bench.stop,

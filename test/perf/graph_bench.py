@@ -204,8 +204,7 @@ class Offline:
 
     def live(self) -> Trajectory:
         """Return the poses as they were published."""
-        stamps = sorted(self.recorder.live)
-        return Trajectory(np.array(stamps, np.int64), np.stack([self.recorder.live[stamp] for stamp in stamps]))
+        return live(self.recorder)
 
 
 class _Timed:
@@ -270,6 +269,12 @@ def run_offline(recording: Recording, duration_s: float | None = None) -> Offlin
         result.recorder.add(pipeline.push(item))
     result.recorder.add(pipeline.flush())
     return result
+
+
+def live(recorder: Recorder) -> Trajectory:
+    """Return the poses as they were published."""
+    stamps = sorted(recorder.live)
+    return Trajectory(np.array(stamps, np.int64), np.stack([recorder.live[stamp] for stamp in stamps]))
 
 
 def rmse_mm(live: Trajectory, truth: Trajectory) -> float:
