@@ -244,9 +244,10 @@ def _pool(around, points, normals, misfit, result):  # type: ignore[no-untyped-d
     for index in range(len(points)):
         count = neighbours(heads, following, sparse, coordinates(points, index), radius, cell_m, found)
         own, total, beside = coordinates(normals, index), np.log(misfit[index] + _LEAST_MISFIT), 1
-        for at in found[:count]:
-            if _is_same_face(own, coordinates(normals, _SPARSE * at)):
-                total += np.log(misfit[_SPARSE * at] + _LEAST_MISFIT)
+        for found_at in found[:count]:
+            at = _SPARSE * found_at
+            if at != index and _is_same_face(own, coordinates(normals, at)):
+                total += np.log(misfit[at] + _LEAST_MISFIT)
                 beside += 1
         result[index] = max(np.exp(total / beside) - _LEAST_MISFIT, 0.0)
 
@@ -254,7 +255,7 @@ def _pool(around, points, normals, misfit, result):  # type: ignore[no-untyped-d
 @njit(cache=True, nogil=True)
 def _blend(around, points, normals, shown, doubts, result):  # type: ignore[no-untyped-def]
     heads, following, cell_m, sparse, radius = around
-    colours, weight, shadowed = shown
+    colours, weight, _ = shown
     in_level, doubt, trust, error = doubts
     found, face, all_around = np.empty(MAX_NEIGHBOURS, np.int64), np.empty(3), np.empty(3)
     for index in range(len(points)):
@@ -262,37 +263,52 @@ def _blend(around, points, normals, shown, doubts, result):  # type: ignore[no-u
         if np.isnan(colours[index, 0]):
             continue
         count = neighbours(heads, following, sparse, coordinates(points, index), radius, cell_m, found)
-        own, grey = coordinates(normals, index), _grey(colours, index)
-        trusts, beside, square = 0.0, 1, grey * grey
-        for channel in range(3):
-            face[channel], all_around[channel] = colours[index, channel], 0.0
-        for found_at in found[:count]:
-            at = _SPARSE * found_at
-            if np.isnan(colours[at, 0]):
-                continue
-            trusts += trust[at]
-            is_alike = shadowed[at] == shadowed[index] and _is_same_face(own, coordinates(normals, at))
-            for channel in range(3):
-                all_around[channel] += trust[at] * colours[at, channel]
-                if is_alike:
-                    face[channel] += colours[at, channel]
-            if is_alike:
-                beside += 1
-                square += _grey(colours, at) ** 2
+        trusts, variance = _look_around(index, found, count, normals, shown, trust, face, all_around)
         if trusts == 0.0:
             continue
-        face /= beside
-        all_around /= trusts
         level = face.mean()
-        variance = max(square / beside - level * level, 0.0)
-        wrong = _NOISE**2 / weight[index] + error[index] * level * level
-        detail = variance / (variance + wrong)
+        detail = variance / (variance + _NOISE**2 / weight[index] + error[index] * level * level)
         gain = min(max(all_around.mean() / max(level, 1e-3), 1.0 / _MOST_GAIN), _MOST_GAIN)
         scale = 1.0 + (gain - 1.0) * in_level[index] / (1.0 + in_level[index])
         share = 1.0 / (1.0 + doubt[index])
         for channel in range(3):
             drawn = scale * (face[channel] + detail * (colours[index, channel] - face[channel]))
             result[index, channel] = share * drawn + (1.0 - share) * all_around[channel]
+
+
+@njit(cache=True, nogil=True)
+def _look_around(index, found, count, normals, shown, trust, face, all_around):  # type: ignore[no-untyped-def]
+    """Fill the means (3,) of the face that a point is on and of all around it; return the trust in these, and the variance on it.
+
+    Args:
+        index: of the point.
+        found, count: its neighbours among the sparse points.
+        normals: (N, 3).
+        shown: colours (N, 3), weight (N,), shadowed (N,).
+        trust: (N,), by which all around are weighed.
+        face, all_around: the answer; the first, and the variance of its grey levels, with the point itself.
+    """
+    colours, _, shadowed = shown
+    own, grey = coordinates(normals, index), _grey(colours, index)
+    trusts, alike, square = 0.0, 1, grey * grey
+    for channel in range(3):
+        face[channel], all_around[channel] = colours[index, channel], 0.0
+    for found_at in found[:count]:
+        at = _SPARSE * found_at
+        if np.isnan(colours[at, 0]):
+            continue
+        trusts += trust[at]
+        is_alike = at != index and shadowed[at] == shadowed[index] and _is_same_face(own, coordinates(normals, at))
+        for channel in range(3):
+            all_around[channel] += trust[at] * colours[at, channel]
+            if is_alike:
+                face[channel] += colours[at, channel]
+        if is_alike:
+            alike += 1
+            square += _grey(colours, at) ** 2
+    face /= alike
+    all_around /= max(trusts, 1e-9)
+    return trusts, max(square / alike - face.mean() ** 2, 0.0)
 
 
 @njit(cache=True, nogil=True)
