@@ -41,8 +41,6 @@ _CONSTRAINTS_AGE = 2
 """Map constraints that answer an older keyframe than this many ago are dropped."""
 _NO_LASER_NS, _NO_IMU_NS = 2 * NANOSECONDS, NANOSECONDS // 2
 """A sensor that says nothing for so long is missed."""
-_NO_IMAGE = (NANOSECONDS // 4, 8)
-"""ns and frame periods: a pose across a gap between images that is longer than both is DEGRADED."""
 _SOLVER_ERRORS = (SmootherError, np.linalg.LinAlgError)
 _RECOVERY_NS = NANOSECONDS
 """A solver that fails twice within this has lost the window."""
@@ -84,7 +82,7 @@ class BackEnd:
         self._reckoning, self._placement = DeadReckoning(), Placement()
         self._last_scan_ns, self._last_imu_ns, self._last_good_ns, self._last_frame_ns, self._unseen_ns = 0, 0, 0, 0, 0
         self._last_failure_ns, self._placed_ns = -_RECOVERY_NS, -1
-        self._longest_unseen_ns = max(_NO_IMAGE[0], int(_NO_IMAGE[1] * NANOSECONDS / calibration.rate_hz))
+        self._longest_unseen_ns = round(calibration.blind_s * NANOSECONDS)
 
     def reset(self, session: int, reason: str) -> None:
         """Forget everything of the old session and wait for a new start."""

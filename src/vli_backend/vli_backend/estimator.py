@@ -81,6 +81,7 @@ class WindowEstimator:
         self._depths = depths
         self._limits = depths.inverse_limits
         self._largest_jump = depths.near
+        self._longest_ns = round(calibration.blind_s * 1e9)
         self._smoother: Smoother = GtsamSmoother(config.window_keyframes)
         self._landmarks = LandmarkTable(config.window_keyframes + 1, depths.spread)
         self._window = Window()
@@ -102,7 +103,7 @@ class WindowEstimator:
         self._window.append(first.stamp_ns, first.stationary, None)
         self._add_observations(first)
         self._records = [FrameRecord(first.stamp_ns, state.T_map_imu @ self._T_imu_cam, first.stationary)]
-        self._predictor = Predictor(self._T_imu_cam)
+        self._predictor = Predictor(self._T_imu_cam, calibration.blind_s)
         self._predictor.set_keyframe(first.stamp_ns, state)
         self._covariance = PoseCovariance(self._T_imu_cam, config.covariance_scale)
         self._covariance.set_keyframe(first.stamp_ns, state.T_map_imu, self._smoother.newest_covariance())
@@ -206,7 +207,7 @@ class WindowEstimator:
             self._window.drop_oldest()
             poses = poses[1:]
         if len(self._records) > 1:
-            interval = close_interval(self._records, self._scans)
+            interval = close_interval(self._records, self._scans, self._longest_ns)
             last = self._records[-1]
             self._window.append(last.stamp_ns, last.stationary, interval)
             poses = np.concatenate([poses, last.T_map_camera[None]])
@@ -277,7 +278,7 @@ class WindowEstimator:
     def _append_keyframe(self, tracks: Tracks, state: KeyframeState, imu: gtsam.PreintegratedCombinedMeasurements | None) -> None:
         elapsed_s = (tracks.stamp_ns - self._window.stamps[-1]) * 1e-9
         still = all(record.stationary for record in self._records)
-        self._window.append(tracks.stamp_ns, tracks.stationary, close_interval(self._records, self._scans))
+        self._window.append(tracks.stamp_ns, tracks.stationary, close_interval(self._records, self._scans, self._longest_ns))
         self._scans = [scan for scan in self._scans if scan.stamp_ns > tracks.stamp_ns]
         self._smoother.add_keyframe(state, imu, elapsed_s)
         if still:

@@ -22,8 +22,6 @@ from vli_common.camera import CameraModel
 from vli_common.geometry import pose
 from vli_common.types import LaserScan, Tracks
 
-_ANY = int(np.iinfo(np.int64).max)
-"""Stripes between keyframes however far apart: rough poses do for rough depths."""
 _ROUNDS = 3
 """Laser depths need poses and poses need laser depths: they alternate."""
 
@@ -132,7 +130,7 @@ def _measure(
     window = Window()
     for k, track in enumerate(tracks):
         pair = [FrameRecord(tracks[i].stamp_ns, poses[i], False) for i in (k - 1, k)] if k else []
-        window.append(track.stamp_ns, False, close_interval(pair, scans, longest_ns=_ANY) if k else None)
+        window.append(track.stamp_ns, False, close_interval(pair, scans) if k else None)
     # Poses are rough yet: so are the depth planes.
     rough = dataclasses.replace(config, depth_max_rms=3 * config.depth_max_rms, primary_only=True)
     for slot in range(len(tracks)):

@@ -19,8 +19,6 @@ _NO_IMU = (0.02, 2e-3)
 
 _REACH_SIGMAS, _HAND_SPEED = 3.0, 1.0
 """How far off a prediction across a gap may be: in its sigmas, and at most by what a hand does, m/s."""
-_BLIND_S = 0.15
-"""Without an image for so long a prediction may be anywhere; over less, the small motion of a hand keeps it near."""
 
 
 @dataclass(frozen=True)
@@ -42,10 +40,11 @@ class Predictor:
 
     Args:
         T_imu_cam: (4, 4).
+        blind_s: without an image for so long a prediction may be anywhere; over less, the small motion of a hand keeps it near.
     """
 
-    def __init__(self, T_imu_cam: FloatArray) -> None:
-        self._T_imu_cam = T_imu_cam
+    def __init__(self, T_imu_cam: FloatArray, blind_s: float) -> None:
+        self._T_imu_cam, self._blind_s = T_imu_cam, blind_s
         self._state: KeyframeState | None = None
         self._T_map_imu_predicted = np.eye(4)
         self._predicted_ns = 0
@@ -97,7 +96,7 @@ class Predictor:
         elapsed = (stamp_ns - last_ns) * 1e-9
         predicted = orthonormalised(last @ inverse(self._T_imu_cam) @ step @ self._T_imu_cam)
         rotation, position = ((s + growth * elapsed) * inflate**0.5 for s, growth in zip(_IMU, _IMU_GROWTH, strict=True))
-        reach = _reach(position, elapsed) if inflate > 1.0 else 0.0
+        reach = self._reach(position, elapsed) if inflate > 1.0 else 0.0
         return Prediction(predicted, nav.velocity(), _information(rotation, position), reach)
 
     def _without_imu(self, stamp_ns: int, stationary: bool) -> Prediction:
@@ -117,11 +116,10 @@ class Predictor:
         predicted[:3, 3] += velocity * ahead * between
         missed = max(elapsed / between, 1.0)
         rotation, position = (missed * sigma for sigma in _NO_IMU)
-        return Prediction(predicted, velocity, _information(rotation, position), _reach(position, elapsed))
+        return Prediction(predicted, velocity, _information(rotation, position), self._reach(position, elapsed))
 
-
-def _reach(sigma_m: float, elapsed_s: float) -> float:
-    return min(_REACH_SIGMAS * sigma_m, _HAND_SPEED * elapsed_s) if elapsed_s > _BLIND_S else 0.0
+    def _reach(self, sigma_m: float, elapsed_s: float) -> float:
+        return min(_REACH_SIGMAS * sigma_m, _HAND_SPEED * elapsed_s) if elapsed_s > self._blind_s else 0.0
 
 
 def _information(rotation: float, position: float) -> FloatArray:

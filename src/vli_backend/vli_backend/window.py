@@ -17,9 +17,6 @@ from vli_common.arrays import AnyArray, BoolArray, ByteArray, FloatArray, IntArr
 from vli_common.geometry import interpolate, inverse
 from vli_common.types import FrameKind, LaserScan, WindowPoses
 
-_LONGEST_NS = 150_000_000
-"""Between long frames farther apart nothing tells the motion of the short ones: a hand trembles at 4 to 12 Hz."""
-
 
 @dataclass(frozen=True)
 class Interval:
@@ -57,7 +54,7 @@ class FrameRecord:
     stationary: bool
 
 
-def close_interval(frames: list[FrameRecord], scans: list[LaserScan], longest_ns: int = _LONGEST_NS) -> Interval:
+def close_interval(frames: list[FrameRecord], scans: list[LaserScan], longest_ns: int | None = None) -> Interval:
     """Return the interval between ``frames[0]`` and ``frames[-1]`` (the keyframes), with the scans taken in it.
 
     Short frames get the pose that the long frames around them tell; where these are farther apart than ``longest_ns``, they are
@@ -89,11 +86,13 @@ def close_interval(frames: list[FrameRecord], scans: list[LaserScan], longest_ns
     )
 
 
-def _between(stamps: IntArray, scans: list[LaserScan], longest_ns: int) -> tuple[list[LaserScan], IntArray]:
+def _between(stamps: IntArray, scans: list[LaserScan], longest_ns: int | None) -> tuple[list[LaserScan], IntArray]:
     """Return the scans taken between long frames (K,) that are near enough, and the index (M,) of the one before each."""
     taken = np.array([scan.stamp_ns for scan in scans], dtype=np.int64)
     before = np.clip(np.searchsorted(stamps, taken, side="right") - 1, 0, len(stamps) - 2)
-    told = (taken > stamps[0]) & (taken < stamps[-1]) & (stamps[before + 1] - stamps[before] <= longest_ns)
+    told = (taken > stamps[0]) & (taken < stamps[-1])
+    if longest_ns is not None:
+        told &= stamps[before + 1] - stamps[before] <= longest_ns
     return [scan for scan, is_told in zip(scans, told, strict=True) if is_told], before[told]
 
 

@@ -45,6 +45,8 @@ __all__ = [
 ]
 
 _CAMERA_COMMAND = "vli calibrate camera DIR --target T --out"
+_BLIND = (0.25, 8.0)
+"""Seconds and frame periods, of which the longer counts."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +63,11 @@ class Calibration:
     imu: ImuCalibration | None
     laser: LaserCalibration | None
     document: dict[str, Any] = field(repr=False, compare=False, default_factory=dict)
+
+    @property
+    def blind_s(self) -> float:
+        """Seconds without a long frame beyond which the motion meanwhile is unknown: a hand trembles at 4 to 12 Hz."""
+        return max(_BLIND[0], _BLIND[1] / self.rate_hz)
 
 
 def load_calibration(path: Path, mode: Mode | None = Mode.VLI_SLAM, imu_path: Path | None = None) -> Calibration:

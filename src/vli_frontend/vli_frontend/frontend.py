@@ -51,7 +51,7 @@ class FrontEnd:
         self._synchroniser = Synchroniser(calibration.timeshift_ns, wait_ns, mode.uses_imu, self.counters)
         self._preintegrator = self._make_preintegrator() if mode.uses_imu else None
         self._time_shift = TimeShiftMonitor(config.time_shift)
-        self._tracker = Tracker(calibration.camera, config, self.counters, first_id)
+        self._tracker = Tracker(calibration.camera, config, self.counters, first_id, calibration.blind_s)
         self._keyframes = KeyframeRule(config.keyframe, calibration.camera.focal_px, mode.uses_laser)
         # Long and short frames alternate: 1.5 frame periods reach the neighbour, and no farther one where the rhythm jitters.
         self._stripes = StripeDistance(round(1.5 * NANOSECONDS / calibration.rate_hz))

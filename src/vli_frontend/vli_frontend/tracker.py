@@ -18,8 +18,6 @@ from vli_frontend.photometry import Frame
 
 _MAX_SIGMA_PX = 2.0
 """A position that is worse is of no use, whatever its own estimate: keeps infinities out of the messages."""
-_BLIND_S = 0.15
-"""After so long without an image no small motion vouches for a track: what does not look like its patch is another point."""
 
 
 @dataclass(slots=True)
@@ -83,9 +81,14 @@ class Tracker:
         config: see :class:`FrontEndConfig`.
         counters: of the stage.
         first_id: of a session's tracks.
+        blind_s: after so long without an image no small motion vouches for a track: what does not look like its patch is another
+            point.
     """
 
-    def __init__(self, camera: CameraModel, config: FrontEndConfig, counters: Counters, first_id: int = 1) -> None:
+    def __init__(
+        self, camera: CameraModel, config: FrontEndConfig, counters: Counters, first_id: int = 1, blind_s: float = np.inf
+    ) -> None:
+        self._blind_s = blind_s
         self._first_id = first_id
         self._camera, self._config, self._counters = camera, config, counters
         self._templates = PatchTemplates(config.max_features)
@@ -145,7 +148,7 @@ class Tracker:
         if self._config.klt.alignment:
             self._align(frame.grey)
         tracks.flow = (tracks.pixels - turned[ok]) / dt_s
-        if dt_s > _BLIND_S:
+        if dt_s > self._blind_s:
             self._keep_proven()
         self._reject(dt_s, rotation)
 

@@ -31,6 +31,6 @@ def test_stripes_get_the_pose_that_the_long_frames_around_them_tell() -> None:
 def test_stripes_within_a_gap_between_long_frames_get_none() -> None:
     frames = [_record(stamp) for stamp in (0, PERIOD, PERIOD + 300 * MS, 2 * PERIOD + 300 * MS)]
     taken = [PERIOD // 2, PERIOD + PERIOD // 2, PERIOD + 290 * MS, PERIOD + 300 * MS + PERIOD // 2]
-    interval = close_interval(frames, [_scan(stamp) for stamp in taken])
+    interval = close_interval(frames, [_scan(stamp) for stamp in taken], 250 * MS)
     assert list(interval.scans) == [taken[0], taken[3]]
     assert len(interval.stamps) == 4
