@@ -7,12 +7,13 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 import rclpy
+from patience import wait
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -52,13 +53,6 @@ def recording(out: Path, *arguments: str) -> Iterator[subprocess.Popen[str]]:
         process.wait()
 
 
-def wait(condition: Callable[[], bool]) -> None:
-    deadline_s = time.monotonic() + _START_S
-    while not condition():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.02)
-
-
 def stored(path: Path) -> list[RawMessage]:
     return list(McapFile(path).messages({IMAGES, IMU, "/vli/calibration"}))
 
@@ -94,7 +88,7 @@ def test_a_recording_has_bit_for_bit_what_was_published(tmp_path: Path, node: No
     publishers = publishers_of(node, ReliabilityPolicy.RELIABLE)
     out = tmp_path / "out"
     with recording(out) as process:
-        wait(lambda: are_heard(publishers))
+        wait(lambda: are_heard(publishers), _START_S)
         play(played, publishers)
         process.send_signal(signal.SIGINT)
         text, told = process.communicate(timeout=60)
@@ -120,9 +114,9 @@ def test_a_killed_recording_is_read_up_to_a_second_before(tmp_path: Path, node: 
               if item.topic == IMU]  # fmt: skip
     partial = tmp_path / "out.partial" / "out_0.mcap"
     with recording(out) as process:
-        wait(lambda: are_heard(publishers))
+        wait(lambda: are_heard(publishers), _START_S)
         play(played, publishers)
-        wait(lambda: len(so_far(out)) == len(played))
+        wait(lambda: len(so_far(out)) == len(played), _START_S)
         play(played[:5], publishers)
         os.kill(process.pid, signal.SIGKILL)
         process.wait()
@@ -144,7 +138,7 @@ def test_best_effort_publishers_are_heard_and_nothing_heard_is_refused(tmp_path:
             publishers[IMU].publish(Imu())
             return len(so_far(out)) > 10
 
-        wait(grows)
+        wait(grows, _START_S)
         process.send_signal(signal.SIGTERM)
         _, told = process.communicate(timeout=60)
     assert process.returncode == 0
@@ -175,7 +169,7 @@ def test_all_takes_what_late_joiners_are_given(tmp_path: Path, node: Node) -> No
     publisher.publish(String(data="cam0: {}"))
     out = tmp_path / "out"
     with recording(out, "--all") as process:
-        wait(lambda: len(so_far(out)) == 1)
+        wait(lambda: len(so_far(out)) == 1, _START_S)
         process.send_signal(signal.SIGINT)
         process.communicate(timeout=60)
     assert process.returncode == 0

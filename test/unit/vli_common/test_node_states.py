@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import threading
-import time
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Iterator
 
 import pytest
 import rclpy
+from patience import PATIENCE_S, wait
 from rclpy.lifecycle import TransitionCallbackReturn
 
 from vli_common.calibration import Calibration
@@ -18,7 +17,6 @@ from vli_common.status import NodeState
 from vli_common.topics import DIAGNOSTICS, STATUS
 
 DONE, REFUSED = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
-PATIENCE_S = 20.0
 
 
 class Worked(VliNode):
@@ -58,13 +56,6 @@ def node(monkeypatch: pytest.MonkeyPatch) -> Iterator[Worked]:
     assert item.close()
     item.destroy_node()
     rclpy.try_shutdown()
-
-
-def wait(condition: Callable[[], Any]) -> None:
-    end_s = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < end_s
-        time.sleep(0.01)
 
 
 def bring_up(node: Worked) -> None:

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import rclpy
+from patience import wait
 
 from vli_driver.nodes.driver_node import DriverNode
-
-WAIT_S = 20.0
 
 
 @pytest.fixture
@@ -25,13 +23,6 @@ def node(monkeypatch: pytest.MonkeyPatch, repository: Path) -> Iterator[DriverNo
     item.close()
     item.destroy_node()
     rclpy.try_shutdown()
-
-
-def wait(condition: Callable[[], object]) -> None:
-    end_s = time.monotonic() + WAIT_S
-    while not condition():
-        assert time.monotonic() < end_s
-        time.sleep(0.01)
 
 
 def test_a_driver_that_waits_for_others_stops_when_it_is_told_to(node: DriverNode) -> None:
