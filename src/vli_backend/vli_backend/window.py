@@ -57,17 +57,17 @@ class FrameRecord:
 def close_interval(frames: list[FrameRecord], scans: list[LaserScan], longest_ns: int | None = None) -> Interval:
     """Return the interval between ``frames[0]`` and ``frames[-1]`` (the keyframes), with the scans taken in it.
 
-    Short frames get the pose that the long frames around them tell; where these are farther apart than ``longest_ns``, they are
-    left out.
+    Short frames get the pose that the long frames around them tell; where these are farther apart than ``longest_ns``, and not at
+    rest, they are left out.
     """
     start, end = frames[0], frames[-1]
     inner = frames[1:-1]
     stamps = np.array([f.stamp_ns for f in frames], dtype=np.int64)
-    scans, before = _between(stamps, scans, longest_ns)
+    rest = np.array([f.stationary for f in frames], np.bool_)
+    scans, before = _between(stamps, rest, scans, longest_ns)
     scan_stamps = np.array([s.stamp_ns for s in scans], dtype=np.int64)
     poses = np.stack([f.T_map_camera for f in frames])
     scan_poses = interpolate_path(stamps, poses, scan_stamps)
-    rest = np.array([f.stationary for f in frames], np.bool_)
 
     all_stamps = np.concatenate([stamps[1:-1], scan_stamps])
     order = np.argsort(all_stamps, kind="stable")
@@ -86,13 +86,15 @@ def close_interval(frames: list[FrameRecord], scans: list[LaserScan], longest_ns
     )
 
 
-def _between(stamps: IntArray, scans: list[LaserScan], longest_ns: int | None) -> tuple[list[LaserScan], IntArray]:
-    """Return the scans taken between long frames (K,) that are near enough, and the index (M,) of the one before each."""
+def _between(
+    stamps: IntArray, rest: BoolArray, scans: list[LaserScan], longest_ns: int | None
+) -> tuple[list[LaserScan], IntArray]:
+    """Return the scans taken between long frames (K,), at rest or near enough, and the index (M,) of the one before each."""
     taken = np.array([scan.stamp_ns for scan in scans], dtype=np.int64)
     before = np.clip(np.searchsorted(stamps, taken, side="right") - 1, 0, len(stamps) - 2)
     told = (taken > stamps[0]) & (taken < stamps[-1])
     if longest_ns is not None:
-        told &= stamps[before + 1] - stamps[before] <= longest_ns
+        told &= (stamps[before + 1] - stamps[before] <= longest_ns) | (rest[before] & rest[before + 1])
     return [scan for scan, is_told in zip(scans, told, strict=True) if is_told], before[told]
 
 

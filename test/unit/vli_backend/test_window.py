@@ -12,8 +12,8 @@ MS = 1_000_000
 PERIOD = 33 * MS
 
 
-def _record(stamp_ns: int) -> FrameRecord:
-    return FrameRecord(stamp_ns, pose(np.eye(3), np.array([stamp_ns * 1e-12, 0.0, 0.0])), False)
+def _record(stamp_ns: int, stationary: bool = False) -> FrameRecord:
+    return FrameRecord(stamp_ns, pose(np.eye(3), np.array([stamp_ns * 1e-12, 0.0, 0.0])), stationary)
 
 
 def _scan(stamp_ns: int) -> LaserScan:
@@ -34,3 +34,9 @@ def test_stripes_within_a_gap_between_long_frames_get_none() -> None:
     interval = close_interval(frames, [_scan(stamp) for stamp in taken], 250 * MS)
     assert list(interval.scans) == [taken[0], taken[3]]
     assert len(interval.stamps) == 4
+
+
+def test_at_rest_a_gap_between_long_frames_does_no_harm() -> None:
+    interval = close_interval([_record(0, True), _record(400 * MS, True)], [_scan(200 * MS)], 250 * MS)
+    assert list(interval.scans) == [200 * MS]
+    assert interval.redundant.all()
