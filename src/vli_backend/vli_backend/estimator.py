@@ -11,13 +11,13 @@ import numpy as np
 from vli_backend.condense import Quadratic, condense, refine
 from vli_backend.config import BackEndConfig
 from vli_backend.depth_prior import DepthPrior
-from vli_backend.frame_pose import FramePose, pose_by_features, solve_frame_pose
+from vli_backend.frame_pose import FramePose
+from vli_backend.frame_tracker import FrameTracker
 from vli_backend.landmarks import LandmarkPoints, LandmarkTable
 from vli_backend.laser_depth import measure_slot
 from vli_backend.map_residuals import condense_map
 from vli_backend.plane_residuals import PlaneResiduals, plane_residuals
 from vli_backend.pose_covariance import PoseCovariance
-from vli_backend.prediction import Prediction, Predictor
 from vli_backend.smoother import Condenser, GtsamSmoother, KeyframeState, Smoother, SmootherError, StatePrior
 from vli_backend.track_noise import whitening
 from vli_backend.window import FrameRecord, Window, close_interval
@@ -80,7 +80,6 @@ class WindowEstimator:
         self._T_imu_cam = inverse(self._T_cam_imu)
         self._depths = depths
         self._limits = depths.inverse_limits
-        self._largest_jump = depths.near
         self._longest_ns = round(calibration.blind_s * 1e9)
         self._smoother: Smoother = GtsamSmoother(config.window_keyframes)
         self._landmarks = LandmarkTable(config.window_keyframes + 1, depths.spread)
@@ -103,8 +102,8 @@ class WindowEstimator:
         self._window.append(first.stamp_ns, first.stationary, None)
         self._add_observations(first)
         self._records = [FrameRecord(first.stamp_ns, state.T_map_imu @ self._T_imu_cam, first.stationary)]
-        self._predictor = Predictor(self._T_imu_cam, calibration.blind_s)
-        self._predictor.set_keyframe(first.stamp_ns, state)
+        self._tracker = FrameTracker(calibration, config, self._T_imu_cam, depths.near)
+        self._tracker.set_keyframe(first.stamp_ns, state)
         self._covariance = PoseCovariance(self._T_imu_cam, config.covariance_scale)
         self._covariance.set_keyframe(first.stamp_ns, state.T_map_imu, self._smoother.newest_covariance())
         self._measure_depths()
@@ -148,7 +147,7 @@ class WindowEstimator:
         if stamp_ns > self._records[-1].stamp_ns:
             last = self._records[-1]
             self._records.append(FrameRecord(stamp_ns, last.T_map_camera, last.stationary))
-            self._predictor.observe(stamp_ns, last.T_map_camera)
+            self._tracker.observe(stamp_ns, last.T_map_camera)
         pose = self._estimate(
             stamp_ns, self._records[-1].T_map_camera, self._state.velocity, self._covariance.of_keyframe(), session
         )
@@ -164,16 +163,14 @@ class WindowEstimator:
         self._make_room()
         tracks, imu = frame.tracks, self._usable(frame.preintegration)
         inflate = frame.preintegration.inflate if frame.preintegration is not None else 1.0
-        predicted = self._predictor.predict(tracks.stamp_ns, imu, tracks.stationary, inflate)
-        self._largest_jump = self._depths.near + predicted.reach_m
-        found = self._frame_pose(tracks, predicted)
-        self._predictor.observe(tracks.stamp_ns, found.T_map_camera)
+        tracked = self._tracker.track(tracks, imu, inflate, self._points)
+        found = tracked.pose
         self._restarted.update(int(i) for i in tracks.ids[(tracks.flags & TrackFlag.TEMPLATE) > 0])
         self._records.append(FrameRecord(tracks.stamp_ns, found.T_map_camera, tracks.stationary))
         if tracks.keyframe:
-            return self._add_keyframe(tracks, imu, found, predicted.velocity, session)
+            return self._add_keyframe(tracks, imu, found, tracked.velocity, session)
         covariance = self._covariance.of_frame(found.T_map_camera @ self._T_cam_imu, found.information)
-        pose = self._estimate(tracks.stamp_ns, found.T_map_camera, predicted.velocity, covariance, session)
+        pose = self._estimate(tracks.stamp_ns, found.T_map_camera, tracked.velocity, covariance, session)
         return FrameResult(pose, found.inliers)
 
     def add_scale(self, ratio: float, sigma: float) -> None:
@@ -196,7 +193,7 @@ class WindowEstimator:
         self._records = [
             FrameRecord(self._window.stamps[-1], self._state.T_map_imu @ self._T_imu_cam, self._window.stationary[-1])
         ]
-        self._predictor.set_keyframe(self._window.stamps[-1], self._state)
+        self._tracker.set_keyframe(self._window.stamps[-1], self._state)
         self._covariance.set_keyframe(self._window.stamps[-1], self._state.T_map_imu, covariance)
 
     def flush(self, session: int) -> WindowPoses | None:
@@ -221,30 +218,6 @@ class WindowEstimator:
             return None
         return cast(gtsam.PreintegratedCombinedMeasurements, preintegration.measurements)
 
-    def _frame_pose(self, tracks: Tracks, predicted: Prediction) -> FramePose:
-        _, rows, columns = np.intersect1d(self._points.ids, tracks.ids, assume_unique=True, return_indices=True)
-        points, rays = self._points.positions[rows], tracks.rays[columns]
-        start = pose_by_features(points, rays, self._camera.focal_px) if predicted.reach_m else None
-        found = solve_frame_pose(
-            predicted.T_map_camera if start is None else start,
-            predicted.information,
-            points,
-            self._points.spread[rows],
-            rays,
-            whitening(self._camera, tracks, self._config.pixel_sigma)[columns],
-            self._config.cauchy,
-        )
-        if self._jump(predicted.T_map_camera, found.T_map_camera) < self._largest_jump:
-            return found
-        # No hand moves that far between two frames: the features are wrong, or the prediction is. Neither makes a pose.
-        return FramePose(predicted.T_map_camera, predicted.information, 0, np.inf, found.iterations)
-
-    @staticmethod
-    def _jump(before: FloatArray, after: FloatArray) -> float:
-        """Return the distance between two poses, metres; infinite where one is not finite."""
-        distance = float(np.linalg.norm(after[:3, 3] - before[:3, 3]))
-        return distance if np.isfinite(distance) else np.inf
-
     # -- one keyframe ------------------------------------------------------------------------------------------------------
 
     def _add_keyframe(
@@ -264,7 +237,7 @@ class WindowEstimator:
         first_ones = moving and self._moving_keyframes <= self._config.start_keyframes
         covariance, problem = self._solve(self._config.start_iterations if first_ones else self._config.iterations)
         self._candidate = tracks, self._state
-        self._predictor.set_keyframe(tracks.stamp_ns, self._state)
+        self._tracker.set_keyframe(tracks.stamp_ns, self._state)
         T = self._state.T_map_imu
         self._records = [FrameRecord(tracks.stamp_ns, T @ self._T_imu_cam, tracks.stationary)]
         self._T_map_odom = T @ inverse(T_odom_imu)
@@ -318,8 +291,8 @@ class WindowEstimator:
             self._smoother.solve(condenser, iterations)
             covariance = self._smoother.newest_covariance()
         self._state = self._smoother.states()[-1]
-        jump = self._jump(self._records[-1].T_map_camera, self._state.T_map_imu @ self._T_imu_cam)
-        if jump > self._largest_jump:
+        jump = self._tracker.jump(self._records[-1].T_map_camera, self._state.T_map_imu @ self._T_imu_cam)
+        if jump is not None:
             raise SmootherError(f"the newest keyframe jumped by {jump:.3f} m")
         poses = self._keyframe_poses()
         self._refine(poses, np.ones(len(self._landmarks), np.bool_))
@@ -409,7 +382,7 @@ class WindowEstimator:
             T_map_camera @ self._T_cam_imu,
             self._T_map_odom,
             velocity,
-            self._predictor.angular_velocity,
+            self._tracker.angular_velocity,
             covariance,
             session,
         )
