@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,6 +10,8 @@ import pytest
 import rclpy
 from patience import wait
 
+from vli_common.messages import status_to_message
+from vli_common.status import Health, NodeState, StageStatus
 from vli_driver.nodes.driver_node import DriverNode
 
 
@@ -27,7 +30,7 @@ def node(monkeypatch: pytest.MonkeyPatch, repository: Path) -> Iterator[DriverNo
 
 def test_a_driver_that_waits_for_others_stops_when_it_is_told_to(node: DriverNode) -> None:
     node.start()
-    wait(lambda: node.newest_session == 1)
+    wait(lambda: node._thread)
     thread = node._thread
     assert thread is not None
     assert thread.is_alive()
@@ -38,7 +41,7 @@ def test_a_driver_that_waits_for_others_stops_when_it_is_told_to(node: DriverNod
 
 def test_a_cleaned_up_driver_has_no_playback_left_beside_the_next_one(node: DriverNode) -> None:
     node.start()
-    wait(lambda: node.newest_session == 1)
+    wait(lambda: node._thread)
     first = node._thread
     node.trigger_deactivate()
     node.trigger_cleanup()
@@ -46,8 +49,17 @@ def test_a_cleaned_up_driver_has_no_playback_left_beside_the_next_one(node: Driv
     assert not first.is_alive()
     node.trigger_configure()
     node.trigger_activate()
-    wait(lambda: node.newest_session == 2)
+    wait(lambda: node._thread)
     assert node._thread is not first
+
+
+def test_a_driver_started_again_begins_a_session_that_the_graph_has_not_had(node: DriverNode) -> None:
+    node.start()
+    wait(lambda: node._thread)
+    assert node.newest_session == 0
+    status = StageStatus(time.time_ns(), "nobody", Health.OK, NodeState.FINISHED, "", {"session": "1", "unmatched": ""})
+    node._on_status(status_to_message(status))
+    wait(lambda: node.newest_session == 2)
 
 
 def test_a_playback_that_fails_ends_the_node_and_does_not_leave_it_idle(

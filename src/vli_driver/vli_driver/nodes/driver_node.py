@@ -144,11 +144,24 @@ class DriverNode(VliNode):
     def _begin_session(self, reason: str, stamp_ns: int) -> None:
         """Raise a session and wait until all have followed; raise another where a newer one is heard of: this is no new graph."""
         deadline_s = time.monotonic() + self._playback.wait_timeout
+        self._hear_others(deadline_s)
         number = -1
         while number != self.newest_session:
             number = self.raise_session(reason, stamp_ns).number
             self._wait_for_all(number, deadline_s)
             if not self._player.rest(_SETTLE_S):
+                return
+
+    def _hear_others(self, deadline_s: float) -> None:
+        """Return when each awaited node has said something, its session too, it takes too long, or all is stopped.
+
+        A driver that is started again would begin with a number that the graph has had, which begins nothing.
+        """
+        awaited = self._awaited()
+        if not awaited:
+            self._player.rest(_SETTLE_S)
+        while any(name not in self.others for name in awaited) and time.monotonic() < deadline_s:
+            if not self._player.rest(_POLL_S):
                 return
 
     def _wait_for_all(self, session: int, deadline_s: float) -> None:
