@@ -85,6 +85,8 @@ def test_who_asks_for_this_machine_alone_gets_the_profile_which_has_nothing_else
     assert use_fresh_ports(tmp_path, 1).get(_RANGE, asked) == given
     set_transport_profile()
     assert (os.environ[_PROFILE], os.environ[_RANGE]) == (str(local_profile()), given)
+    # Nodes that are started again are children of a process which this one started before.
+    assert use_fresh_ports(tmp_path, 1).get(_RANGE, asked) == given
 
 
 def test_a_foreign_profile_and_the_range_beside_it_are_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
