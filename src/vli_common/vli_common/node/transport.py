@@ -79,9 +79,9 @@ def _environment(profile: Path) -> dict[str, str]:
     """Return the variables that have a process use ``profile``, which has the loopback interface only."""
     variables = {_PROFILE_VARIABLES[0]: str(profile)}
     if os.environ.get(_RANGE_VARIABLE) in (_LOCALHOST, _AS_THE_PROFILE_SAYS):
-        # For LOCALHOST, rmw adds transports of its own, with sockets on every interface and shared memory, and has each announcement
-        # go out twice to 32 ports instead of once to the group. Where this process has had that replaced for itself, a child may
-        # still come from one that has not.
+        # For LOCALHOST, rmw adds transports of its own, with sockets on every interface and shared memory, and has each
+        # announcement go out twice to 32 ports instead of once to the group. Where this process has had that replaced for itself,
+        # a child may still come from one that has not.
         variables[_RANGE_VARIABLE] = _AS_THE_PROFILE_SAYS
     return variables
 
