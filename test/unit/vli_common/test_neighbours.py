@@ -37,7 +37,7 @@ def say(clock: Clock, node: str, started_s: int, state: NodeState = NodeState.RE
 
 
 def test_a_node_started_anew_is_news_once(neighbours: Neighbours, clock: Clock) -> None:
-    assert neighbours.take(say(clock, "backend_node", 60)) is News.KNOWN
+    assert neighbours.take(say(clock, "backend_node", 60)) is News.FIRST
     assert neighbours.take(say(clock, "backend_node", 99)) is News.RESTARTED
     assert neighbours.take(say(clock, "backend_node", 99)) is News.KNOWN
     assert neighbours.hint == ""
@@ -57,7 +57,7 @@ def test_two_nodes_of_one_name_are_told_and_no_restart_is_seen_after_the_first(n
     for _ in range(10):
         news += [neighbours.take(say(clock, "backend_node", started_s)) for started_s in (60, 90)]
         clock.now_s += 1.0
-    assert news[:2] == [News.KNOWN, News.RESTARTED]
+    assert news[:2] == [News.FIRST, News.RESTARTED]
     assert news[2:] == [News.NAMESAKE, News.KNOWN] * 9
     assert neighbours.hint == "'backend_node' runs twice: end one, or give each graph a namespace, or a ROS_DOMAIN_ID"
     clock.now_s += 10.0
@@ -66,7 +66,7 @@ def test_two_nodes_of_one_name_are_told_and_no_restart_is_seen_after_the_first(n
 
 @pytest.mark.parametrize("started_s", [40, 60])
 def test_a_node_notices_that_another_has_its_name(neighbours: Neighbours, clock: Clock, started_s: int) -> None:
-    assert neighbours.take(say(clock, "demux_node", 50)) is News.KNOWN
+    assert neighbours.take(say(clock, "demux_node", 50)) is News.FIRST
     assert neighbours.take(say(clock, "demux_node", started_s)) is News.NAMESAKE
     assert neighbours.statuses["demux_node"].values["started_ns"] == str(50 * SECOND_NS)
     assert "'demux_node' runs twice" in neighbours.hint
@@ -80,7 +80,7 @@ def test_a_node_started_anew_after_the_clock_was_set_back_is_heard(neighbours: N
 
 def test_a_name_costs_a_sender_nothing_so_that_their_number_is_limited(neighbours: Neighbours, clock: Clock) -> None:
     news = [neighbours.take(say(clock, f"node{number}", 0)) for number in range(100)]
-    assert news == [News.KNOWN] * 64 + [News.TOO_MANY] * 36
+    assert news == [News.FIRST] * 64 + [News.TOO_MANY] * 36
 
 
 def test_who_has_finished_has_done_so_in_a_session(neighbours: Neighbours, clock: Clock) -> None:

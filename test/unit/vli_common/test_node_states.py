@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Iterator
 
 import pytest
@@ -12,8 +13,9 @@ from rclpy.lifecycle import TransitionCallbackReturn
 
 from vli_common.calibration import Calibration
 from vli_common.errors import VliError
+from vli_common.messages import status_to_message
 from vli_common.node import VliNode, working
-from vli_common.status import NodeState
+from vli_common.status import Health, NodeState, StageStatus
 from vli_common.topics import DIAGNOSTICS, STATUS
 
 DONE, REFUSED = TransitionCallbackReturn.SUCCESS, TransitionCallbackReturn.FAILURE
@@ -124,3 +126,12 @@ def test_diagnostics_of_two_scanners_have_different_names(node: Worked, monkeypa
     monkeypatch.setattr(node, "send", lambda topic, message: sent.update({topic.name: message.status[0].name}))
     node.publish_status()
     assert sent == {STATUS.name: "worked_node", DIAGNOSTICS.name: "left/worked_node"}
+
+
+def test_who_comes_is_answered_at_once_and_only_then(node: Worked, monkeypatch: pytest.MonkeyPatch) -> None:
+    answers: list[str] = []
+    monkeypatch.setattr(node, "publish_status", lambda: answers.append("status"))
+    for started, answered in (("1", 1), ("1", 1), ("2", 2), ("2", 2)):
+        status = StageStatus(time.time_ns(), "newcomer", Health.OK, NodeState.READY, "", {"session": "0", "started_ns": started})
+        node._on_status(status_to_message(status))
+        assert len(answers) == answered

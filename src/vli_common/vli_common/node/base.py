@@ -33,6 +33,7 @@ _LOOK_PERIOD_S = 0.1
 _ABOUT_THE_NODE = {topic.name for topic in (STATUS, DIAGNOSTICS, SESSION, CALIBRATION)}
 _WAITING_HINT = "waiting for a calibration: give 'calibration_file' to the driver node or to this one"
 _RUNNING = (NodeState.READY, NodeState.PAUSED, NodeState.FINISHED)
+_ANSWERED = (News.FIRST, News.RESTARTED)
 _IGNORED = {News.NAMESAKE: "status_of_namesakes", News.TOO_MANY: "status_of_too_many_nodes"}
 
 
@@ -316,6 +317,9 @@ class VliNode(StageHooks, WorkingNode):
             self._begin(Session(session, f"heard of from {status.node}"))
         if status.values.get("session") == str(self._newest_session):
             self._note_sent(status)
+        if news in _ANSWERED:
+            # Who has just come hears of this node at once, and of its session; that may be all it waits for.
+            self.publish_status()
 
     def _note_sent(self, status: StageStatus) -> None:
         for name, entry in self._inputs.items():

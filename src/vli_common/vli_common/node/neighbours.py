@@ -19,8 +19,10 @@ _ALIVE_S = 3.0
 class News(Enum):
     """What a status brings."""
 
+    FIRST = auto()
+    """A node that was not known."""
     KNOWN = auto()
-    """More of a node that is known, or the first of one."""
+    """More of one that is."""
     RESTARTED = auto()
     """The node was started anew: what it knew is gone."""
     NAMESAKE = auto()
@@ -60,7 +62,9 @@ class Neighbours:
         if known is None and len(self.statuses) >= _MOST:
             return News.TOO_MANY
         self.statuses[status.node], self._heard_s[status.node] = status, now_s
-        return News.RESTARTED if known is not None and begun_ns and 0 < known_ns != begun_ns else News.KNOWN
+        if known is None:
+            return News.FIRST
+        return News.RESTARTED if begun_ns and 0 < known_ns != begun_ns else News.KNOWN
 
     def finished(self, session: int) -> dict[str, Mapping[str, str]]:
         """Return the values of each node that has finished this session."""
