@@ -11,7 +11,8 @@ A neighbourhood has a level, the mean over the face, and details, which differ f
 drawn towards that of all around that is doubted less, by one factor for the whole face: print keeps its contrast. The details
 keep the share V / (V + V₀), V their variance and V₀ that of their error: the best linear estimate (after Lee, "Digital image
 enhancement and noise filtering by use of local statistics", 1980), but that V has the error in it and so errs on the side of
-detail. Points that may fly, that have no normal or that the light does not reach take the colour around instead.
+detail. Points that may fly, that have no normal or that the light does not reach take the colour around instead. Where all around
+is doubted, the nearest that is trusted counts to it (``trusted_colours``).
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from vli_mapping.normals import MAX_NEIGHBOURS
 from vli_mapping.point_map import PointMap, to_bytes
 from vli_mapping.ray_casting import cast, direct
 from vli_mapping.spatial_hash import SpatialHash, coordinates, neighbours
+from vli_mapping.trusted_colours import from_afar
 
 _REACH = 2.0
 """Times the radius of the normals: the neighbourhood."""
@@ -54,6 +56,8 @@ _ROUGH, _SHADOWED = 4.0, 10.0
 _LEAST = 0.02
 """Doubt of the best neighbour: one alone is no better than several."""
 _LEAST_AGREEMENT = 0.1
+_TRUST_AFAR = 1.0
+"""Of all that the nearest trusted points say: a neighbourhood with any good point has more of its own."""
 _CHUNK = 1 << 17
 """Points whose views are gathered at a time: each is a matrix."""
 _SHADOW_M, _SHADOW_HEIGHT_M, _SHADOW_RADIUS_M, _SHADOW_WEIGHT = 0.012, 4e-4, 3e-4, 2.0
@@ -200,7 +204,8 @@ class _Neighbourhood:
         trust = 1.0 / (in_level + _MISFIT_DOUBT * views.misfit + _UNLIT / views.weight + doubt + _LEAST)
         error = _MISFIT * misfit + _CURVED * scatter
         shown = (views.colours, views.weight, views.shadowed)
-        _blend(self._around, self._points, normals, shown, (in_level, doubt, trust, error), result)
+        far = from_afar(self._points, views.colours, trust)
+        _blend(self._around, self._points, normals, shown, (in_level, doubt, trust, error), far, result)
         return result
 
 
@@ -253,7 +258,7 @@ def _pool(around, points, normals, misfit, result):  # type: ignore[no-untyped-d
 
 
 @njit(cache=True, nogil=True)
-def _blend(around, points, normals, shown, doubts, result):  # type: ignore[no-untyped-def]
+def _blend(around, points, normals, shown, doubts, far, result):  # type: ignore[no-untyped-def]
     heads, following, cell_m, sparse, radius = around
     colours, weight, _ = shown
     in_level, doubt, trust, error = doubts
@@ -264,7 +269,11 @@ def _blend(around, points, normals, shown, doubts, result):  # type: ignore[no-u
             continue
         count = neighbours(heads, following, sparse, coordinates(points, index), radius, cell_m, found)
         trusts, variance = _look_around(index, found, count, normals, shown, trust, face, all_around)
-        if trusts == 0.0:
+        if not np.isnan(far[index, 0]):
+            for channel in range(3):
+                total = trusts * all_around[channel] + _TRUST_AFAR * far[index, channel]
+                all_around[channel] = total / (trusts + _TRUST_AFAR)
+        elif trusts == 0.0:
             continue
         level = face.mean()
         detail = variance / (variance + _NOISE**2 / weight[index] + error[index] * level * level)

@@ -128,6 +128,21 @@ def wall_and_floor() -> tuple[FloatArray, FloatArray, BoolArray]:
     return points, normals, (points[:, 0] < RIDGE_X + 1e-9) | (height > 0.004 - SPACING)
 
 
+def test_where_nothing_around_has_a_normal_the_nearest_that_is_trusted_gives_the_colour() -> None:
+    points, normals = floor()
+    wall, wall_normals = flank(85.0)
+    wall += np.array([0.012, 0.0, -0.004])
+    every, turned = np.concatenate([points, wall]), np.concatenate([normals, wall_normals])
+    is_wall = np.arange(len(every)) >= len(points)
+    colours = seen(every, turned, np.full(len(every), 0.6))
+    point_map = mapped(every, np.where(is_wall[:, None], 0.0, turned), colours, ~is_wall)
+    rho = albedo(point_map, LIGHT).mean(axis=1)
+    of_floor = np.median(rho[~is_wall])
+    alone = mapped(wall, np.zeros_like(wall), colours[is_wall])
+    assert np.median(albedo(alone, LIGHT)) < 0.5 * of_floor
+    np.testing.assert_allclose(rho[is_wall], of_floor, rtol=0.3)
+
+
 def test_what_stands_in_the_way_of_the_light_is_found() -> None:
     points, normals, lit = wall_and_floor()
     point_map = mapped(points, normals, seen(points, normals, np.ones(len(points)), lit))
