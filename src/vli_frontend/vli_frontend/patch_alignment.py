@@ -104,7 +104,11 @@ class PatchTemplates:
         return result
 
 
-@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+# Kernels with fast mathematics that others call are inlined by force. Else LLVM keeps two versions, one vectorised in its caller,
+# which round differently; which of them runs depends on whether it was compiled in this process or comes from the cache.
+
+
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy", forceinline=True)
 def _sample(grey: ByteArray, x: float, y: float, warp: FloatArray, out: Float32Array) -> None:
     """Write the bilinear values (_PIXELS,) of the image under the warp; beyond the border its edge is repeated."""
     height, width = grey.shape
@@ -124,7 +128,7 @@ def _sample(grey: ByteArray, x: float, y: float, warp: FloatArray, out: Float32A
         out[k] = top + fy * (bottom - top)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True, fastmath=True, forceinline=True)
 def _sample_square(grey: ByteArray, x: float, y: float, out: Float32Array) -> None:
     """Write the bilinear values of an upright square centred on a point, all inside the image."""
     size = len(out)
@@ -139,7 +143,7 @@ def _sample_square(grey: ByteArray, x: float, y: float, out: Float32Array) -> No
             out[j, i] = (one - fy) * top + fy * bottom
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True, fastmath=True, forceinline=True)
 def _fill_rows(square: Float32Array, patch: Float32Array, rows: Float32Array) -> None:
     """Write the patch (_PIXELS,) and the rows (_UNKNOWNS, _PIXELS) of the linear model from its square with a rim of one."""
     half, total = np.float32(0.5), np.float32(0.0)
@@ -218,7 +222,7 @@ def _create(
             sigma[slot] = math.sqrt(0.5 * ((solvers[slot, :2] ** 2).sum()))
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True, fastmath=True, forceinline=True)
 def _fill_solver(rows: Float32Array, inverse: FloatArray, solver: Float32Array) -> None:
     """Write (JᵀWJ)⁻¹ JᵀW, (_UNKNOWNS, _PIXELS)."""
     for i in range(_UNKNOWNS):
@@ -231,7 +235,7 @@ def _fill_solver(rows: Float32Array, inverse: FloatArray, solver: Float32Array) 
             solver[i, k] *= _WEIGHT[k]
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True, fastmath=True, forceinline=True)
 def _solve(solver: Float32Array, values: Float32Array, unknowns: FloatArray) -> None:
     for i in range(_UNKNOWNS):
         total = np.float32(0.0)
@@ -257,7 +261,7 @@ def _compose(pixel: FloatArray, warp: FloatArray, unknowns: FloatArray) -> float
     return math.hypot(tx, ty)
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True, fastmath=True, forceinline=True)
 def _agreement(patch: Float32Array, values: Float32Array, unknowns: FloatArray) -> tuple[float, float]:
     """Return the weighted correlation of the values with the patch under the fitted light, and the RMS of what differs."""
     mean = 0.0

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -118,3 +123,28 @@ def test_sigma_tells_a_patch_across_a_depth_edge(pattern: ByteArray) -> None:
         split[y - 20 : y + 21, x : x + 20] = near[y - 20 : y + 21, x : x + 20]
     whole, torn = align(pattern, far, POINTS), align(pattern, split, POINTS)
     assert np.all(torn.sigma > 2 * whole.sigma)
+
+
+_ALIGN_AND_PRINT = """
+import numpy as np
+from planar_scene import texture
+from vli_frontend.patch_alignment import PatchTemplates
+image, slots = texture(0), np.arange(20)
+pixels = np.random.default_rng(0).uniform(30.0, 90.0, (20, 2))
+templates = PatchTemplates(20)
+templates.create(image, slots, pixels)
+found = templates.align(image, slots, pixels + 0.7, np.tile(np.eye(2), (20, 1, 1)))
+print(found.converged.sum(), np.concatenate([found.pixels.ravel(), found.correlation]).tobytes().hex())
+"""
+
+
+@pytest.mark.slow
+def test_kernels_that_were_just_compiled_round_as_those_of_the_cache_do(tmp_path: Path) -> None:
+    path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": path}
+    command = [sys.executable, "-c", _ALIGN_AND_PRINT]
+    first, second = (
+        subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout for _ in range(2)
+    )
+    assert int(first.split()[0]) > 10
+    assert first == second
