@@ -30,11 +30,11 @@ $(VENV)/.installed: requirements.txt requirements-dev.txt requirements.lock $(BU
 	@touch $@
 
 test: lint
-	$(BIN)/python -m pytest -m "not slow and not perf"
+	$(BIN)/python -m pytest -m "not slow"
 
 test-all: lint $(NUMPY1_VENV)/.installed
 	$(BIN)/python -m pytest
-	$(NUMPY1_VENV)/bin/python -m pytest -m "not slow and not perf and not lint"
+	$(NUMPY1_VENV)/bin/python -m pytest -m "not slow and not lint"
 
 $(NUMPY1_VENV)/.installed: requirements-numpy1.lock $(BUILD_FILES)
 	$(PYTHON) -m venv $(NUMPY1_VENV)
@@ -52,7 +52,6 @@ format: venv
 	$(BIN)/ruff format .
 
 bench: venv
-	$(BIN)/python -m pytest -m perf -q test/perf
 	@for script in $(filter-out %/bench_estimator.py %/bench_graph.py,$(wildcard test/perf/bench_*.py)); do \
 		echo "== $$script"; \
 		test -d $(RECORDING) || { echo "skipped: needs the recording '$(RECORDING)'"; continue; }; \
