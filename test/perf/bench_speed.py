@@ -2,8 +2,8 @@
 
     python test/perf/bench_speed.py [--recording ../shared/data/keyboard_short] [--runs N] [--modes vli-slam vli-odom]
 
-Times mean something on an idle machine only. Runs in turn, each in a process of its own, as users have it. ``stolen`` is the share of the processors that other machines took
-meanwhile, and ``busy`` what anything else here did, both of /proc/stat.
+Times mean something on an idle machine only. Runs in turn, each in a process of its own, as users have it. ``stolen`` is the
+share of the processors that other machines took meanwhile, and ``busy`` what anything else here did, both of /proc/stat.
 """
 
 from __future__ import annotations
