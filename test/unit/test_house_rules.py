@@ -109,6 +109,12 @@ def test_packages_import_only_those_they_may():
     assert wrong == []
 
 
+@pytest.mark.parametrize("package", sorted(set(PACKAGES) - {"vli_common"}))
+def test_whoever_imports_a_package_first_has_blas_limited_before_numpy_comes(package: str) -> None:
+    (module,) = (module for module in MODULES if module.path == SOURCES / package / package / "__init__.py")
+    assert [name for _, name in module.imports()] == ["vli_common"]
+
+
 def test_algorithm_modules_know_nothing_of_ros():
     wrong = [
         f"{module}:{line} imports {name}"

@@ -1,1 +1,4 @@
 """The vli command: offline pipeline, replay, evaluation and demo; see docs/architecture.md."""
+
+# Before anything here imports numpy: it limits BLAS to one thread.
+import vli_common as vli_common

@@ -2,3 +2,6 @@
 
 Nothing here is needed on a robot; only ``vli simulate`` and the tests use it.
 """
+
+# Before anything here imports numpy: it limits BLAS to one thread.
+import vli_common as vli_common
