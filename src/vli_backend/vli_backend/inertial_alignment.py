@@ -12,6 +12,7 @@ of it turns into more acceleration than the hand has.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -40,6 +41,11 @@ class VisualInterval:
     centres: FloatArray
     rotations: FloatArray
     measurements: list[gtsam.PreintegratedCombinedMeasurements]
+
+    @cached_property
+    def deltas(self) -> Deltas:
+        """What the IMU says of it; a third of the work of an alignment, so it is asked for while there is time."""
+        return _deltas(self.measurements)
 
 
 @dataclass(frozen=True)
@@ -90,7 +96,7 @@ class InertialAlignment:
 
 
 @dataclass(frozen=True)
-class _Deltas:
+class Deltas:
     """Preintegrated Δp, Δv (M, 3), their Jacobians (M, 3, 6) on [accelerometer, gyro] bias, and the last ΔR with its own."""
 
     times: FloatArray
@@ -135,7 +141,7 @@ class _Problem:
         self._rotations, self._centres = T_world_keyframe[:, :3, :3], T_world_keyframe[:, :3, 3]
         self._visual_rotations = self._rotations
         self._intervals, self._lever, self._sigmas = intervals, lever, sigmas
-        self._deltas = [_deltas(interval.measurements) for interval in intervals]
+        self._deltas = [interval.deltas for interval in intervals]
         self._scale, self._bias = 1.0, np.zeros(6)
         self._velocities = np.zeros((self._count, 3))
         self.gravity = np.zeros(3)
@@ -196,14 +202,13 @@ class _Problem:
         jacobian[:frames, :, at + 3 : at + 6] = R @ skew(alpha)
         jacobian[frames, :, at + 3 : at + 6] = R @ skew(beta)
         jacobian[frames, :, at + 6 : at + 9] = np.eye(3)
-        whitener = self._whitener(t, self._scale)
+        small = 1e-4 * self._scale
+        whitener, more, less = self._whiteners(t, self._scale + np.array([0.0, small, -small]))
         white = (whitener @ jacobian.reshape(frames + 1, -1)).reshape(-1, width)
         if total:
             # Positions from images err, and the scale multiplies them: with fixed weights their noise alone would shrink it. The
             # weights' own change with the scale makes it total least squares, which has no such bias.
-            small = 1e-4 * self._scale
-            change = (self._whitener(t, self._scale + small) - self._whitener(t, self._scale - small)) / (2 * small)
-            white[:, 0] += (change @ error).reshape(-1)
+            white[:, 0] += ((more - less) / (2 * small) @ error).reshape(-1)
         return white, (whitener @ error).reshape(-1)
 
     def _turn_rows(self, k: int, head: int, width: int) -> tuple[FloatArray, FloatArray]:
@@ -242,8 +247,8 @@ class _Problem:
         self._velocities = self._velocities + each[:, :3]
         self._rotations = self._rotations @ so3_exp(each[:, 3:])
 
-    def _whitener(self, t: FloatArray, scale: float) -> FloatArray:
-        """Return W (M + 1, M + 1) with Wᵀ W the inverse covariance of Δp at M times and of Δv at the last, one axis.
+    def _whiteners(self, t: FloatArray, scales: FloatArray) -> FloatArray:
+        """Return W (S, M + 1, M + 1) with Wᵀ W the inverse covariance of Δp at M times and of Δv at the last, one axis.
 
         White noise of the accelerometer makes Δp and Δv integrals of one random walk; a frame and its keyframe err each by the
         position's sigma, so that the keyframe's error is common to all.
@@ -255,12 +260,13 @@ class _Problem:
         covariance[:frames, frames] = covariance[frames, :frames] = t**2 / 2
         covariance[frames, frames] = t[-1]
         covariance *= sigmas.accelerometer**2
-        covariance[:frames, :frames] += (sigmas.position * scale) ** 2 * (np.eye(frames) + 1.0)
-        result: FloatArray = np.linalg.inv(np.linalg.cholesky(covariance))
+        of_scales = np.tile(covariance, (len(scales), 1, 1))
+        of_scales[:, :frames, :frames] += (sigmas.position * scales[:, None, None]) ** 2 * (np.eye(frames) + 1.0)
+        result: FloatArray = np.linalg.inv(np.linalg.cholesky(of_scales))
         return result
 
 
-def _deltas(measurements: list[gtsam.PreintegratedCombinedMeasurements]) -> _Deltas:
+def _deltas(measurements: list[gtsam.PreintegratedCombinedMeasurements]) -> Deltas:
     """Return the preintegrated motion of each frame at zero bias, with Jacobians by differences: GTSAM keeps its own."""
     steps = np.concatenate([1e-3 * np.eye(6)[:3], 1e-4 * np.eye(6)[3:]])
     size = steps.sum(axis=1)
@@ -272,7 +278,7 @@ def _deltas(measurements: list[gtsam.PreintegratedCombinedMeasurements]) -> _Del
     )
     turn = np.stack([so3_log(base[-1][2].T @ moved[-1][axis][2]) / size[axis] for axis in (3, 4, 5)], axis=1)
     times = np.array([pim.deltaTij() for pim in measurements])
-    return _Deltas(times, positions, velocities, position_jacobian, velocity_jacobian, base[-1][2], turn)
+    return Deltas(times, positions, velocities, position_jacobian, velocity_jacobian, base[-1][2], turn)
 
 
 def _slopes(value: FloatArray, moved: list[FloatArray], steps: FloatArray) -> FloatArray:

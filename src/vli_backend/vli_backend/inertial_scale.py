@@ -41,7 +41,8 @@ class InertialScale:
         """Begin a new piece."""
         self._keyframes: list[FloatArray] = []
         self._keyframe_ns = 0
-        self._between: list[list[tuple[FloatArray, FrontEndOutput]]] = []
+        self._intervals: list[VisualInterval] = []
+        self._since: list[tuple[FloatArray, FrontEndOutput]] = []
 
     def add_frame(self, frame: FrontEndOutput, estimate: PoseEstimate) -> tuple[float, float] | None:
         """Take a frame and its live pose; at the end of a piece return scale and relative sigma."""
@@ -52,22 +53,25 @@ class InertialScale:
         follows = imu is not None and imu.from_ns == self._keyframe_ns and imu.inflate == 1.0
         if frame.tracks.stationary or (self._keyframes and not follows):
             self.clear()
-        if self._between:
-            self._between[-1].append((seen, frame))
+        if self._keyframes:
+            self._since.append((seen, frame))
         if not frame.tracks.keyframe:
             return None
-        self._keyframes.append(seen)
         self._keyframe_ns = frame.tracks.stamp_ns
-        self._between.append([])
+        if self._keyframes:
+            self._intervals.append(_interval(self._since))
+        self._keyframes.append(seen)
+        self._since = []
         if len(self._keyframes) < _KEYFRAMES:
             return None
-        found = align_structure(
-            np.stack(self._keyframes), [_interval(b) for b in self._between[:-1]], self._T_imu_cam[:3, 3], self._sigmas
-        )
-        self._keyframes, self._between = [seen], [[]]
+        found = align_structure(np.stack(self._keyframes), self._intervals, self._T_imu_cam[:3, 3], self._sigmas)
+        self._keyframes, self._intervals = [seen], []
         return found.scale, found.scale_sigma
 
 
 def _interval(frames: list[tuple[FloatArray, FrontEndOutput]]) -> VisualInterval:
+    """Return the frames since the last keyframe, with all that can be worked out before the piece is at its end."""
     T = np.stack([seen for seen, _ in frames])
-    return VisualInterval(T[:, :3, 3], T[:, :3, :3], [measurements_of(frame.preintegration) for _, frame in frames])
+    result = VisualInterval(T[:, :3, 3], T[:, :3, :3], [measurements_of(frame.preintegration) for _, frame in frames])
+    _ = result.deltas
+    return result
