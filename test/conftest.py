@@ -34,11 +34,14 @@ def shared_data() -> Path:
     return path
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="module", autouse=True)
 def own_domain() -> Iterator[None]:
-    """Keep the nodes of a module apart from whatever else speaks ROS on this machine."""
+    """Keep the nodes of a module apart from whatever else speaks ROS on this machine.
+
+    Beyond 101, a domain's ports are among those that Linux gives to anybody.
+    """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("ROS_DOMAIN_ID", str(random.randint(100, 200)))
+        patch.setenv("ROS_DOMAIN_ID", str(random.randint(1, 101)))
         yield
 
 

@@ -28,7 +28,7 @@ from vli_common.node.transport import message_type, quality
 from vli_common.topics import MAP
 from vli_mapping.map_file import load_map
 
-pytestmark = [pytest.mark.graph, pytest.mark.usefixtures("own_domain")]
+pytestmark = pytest.mark.graph
 
 _MAPPING, _BACK_END = "mapping_node", "backend_node"
 _LOOP = {"driver_node": {"loop": True}}

@@ -302,7 +302,7 @@ def main() -> None:
     parser.add_argument("--duration", type=float, default=None, metavar="S", help="seconds of the bag (default: all)")
     options = parser.parse_args()
     os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    os.environ.setdefault("ROS_DOMAIN_ID", str(random.randint(100, 200)))
+    os.environ.setdefault("ROS_DOMAIN_ID", str(random.randint(1, 101)))
     with tempfile.TemporaryDirectory() as directory:
         bench = Bench(Recording(options.bag), options, Path(directory), Table())
         for name in options.only:

@@ -33,7 +33,7 @@ from vli_common.node.transport import message_type, quality
 from vli_common.status import NodeState
 from vli_common.topics import STATUS
 
-pytestmark = [pytest.mark.graph, pytest.mark.usefixtures("own_domain")]
+pytestmark = pytest.mark.graph
 
 
 @pytest.fixture

@@ -31,7 +31,7 @@ _START_S = 240.0
 
 
 @pytest.fixture
-def scanner(own_domain: None) -> Iterator[Node]:
+def scanner() -> Iterator[Node]:
     """Return a node of a process of its own, as far as the middleware can tell."""
     set_transport_profile()
     context = Context()

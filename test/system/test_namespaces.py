@@ -17,7 +17,7 @@ from vli_common.calibration import load_calibration
 _UNKNOWN = "_NODE_NAMESPACE_UNKNOWN_"
 """What ROS says of an end whose node it has not heard of yet."""
 
-pytestmark = [pytest.mark.graph, pytest.mark.usefixtures("own_domain")]
+pytestmark = pytest.mark.graph
 
 
 def test_scanners_in_namespaces_of_their_own_share_nothing_but_diagnostics(tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ _START_S = 120.0
 
 
 @pytest.fixture(scope="module")
-def node(own_domain: None) -> Iterator[Node]:
+def node() -> Iterator[Node]:
     """Return a node in a domain apart from whatever else speaks ROS on this machine."""
     set_transport_profile()
     rclpy.init(signal_handler_options=rclpy.SignalHandlerOptions.NO)

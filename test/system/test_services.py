@@ -15,7 +15,7 @@ from vli_common.calibration import load_calibration
 from vli_common.status import NodeState
 from vli_mapping.map_file import load_map
 
-pytestmark = [pytest.mark.graph, pytest.mark.usefixtures("own_domain")]
+pytestmark = pytest.mark.graph
 
 _MAPPING, _BACK_END, _DRIVER = "mapping_node", "backend_node", "driver_node"
 _ANSWER_S = 60.0

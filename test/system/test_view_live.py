@@ -45,7 +45,7 @@ class Heard:
 
 
 @pytest.fixture
-def graph(own_domain: None) -> Iterator[Node]:
+def graph() -> Iterator[Node]:
     """Return a node of a process of its own, as far as the middleware can tell."""
     set_transport_profile()
     context = Context()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import threading
 import time
 from collections.abc import Iterator
@@ -58,6 +59,13 @@ def node(monkeypatch: pytest.MonkeyPatch) -> Iterator[Worked]:
     assert item.close()
     item.destroy_node()
     rclpy.try_shutdown()
+
+
+@pytest.fixture
+def no_collection() -> Iterator[None]:
+    gc.disable()
+    yield
+    gc.enable()
 
 
 def bring_up(node: Worked) -> None:
@@ -135,3 +143,18 @@ def test_who_comes_is_answered_at_once_and_only_then(node: Worked, monkeypatch: 
         status = StageStatus(time.time_ns(), "newcomer", Health.OK, NodeState.READY, "", {"session": "0", "started_ns": started})
         node._on_status(status_to_message(status))
         assert len(answers) == answered
+
+
+def test_a_destroyed_node_leaves_the_graph_without_a_garbage_collection(
+    monkeypatch: pytest.MonkeyPatch, no_collection: None
+) -> None:
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    rclpy.init(args=[])
+    observer = rclpy.create_node("observer")
+    node = Worked()
+    name = (node.get_name(), node.get_namespace())
+    wait(lambda: name in observer.get_node_names_and_namespaces())
+    node.destroy_node()
+    wait(lambda: name not in observer.get_node_names_and_namespaces())
+    observer.destroy_node()
+    rclpy.try_shutdown()

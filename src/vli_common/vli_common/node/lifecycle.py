@@ -64,6 +64,11 @@ class ManagedNode(LifecycleNode):
             raise self._refusal or VliError(f"'{self.get_name()}' cannot be configured")
         self.trigger_activate()
 
+    def destroy_node(self) -> None:
+        """Take the node out of the graph now: rclpy leaves its state machine, and the node with it, to a garbage collection."""
+        self._state_machine.destroy_when_not_in_use()
+        super().destroy_node()
+
     # What rclpy calls
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
