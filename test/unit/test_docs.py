@@ -62,6 +62,13 @@ def test_every_parameter_of_nodes_alone_stands_in_docs_topics() -> None:
     assert set(CODE.findall((REPOSITORY / "docs/topics.md").read_text())) >= NODE_ONLY
 
 
+@pytest.mark.parametrize("package", ["vli_common", "vli_driver", "vli_frontend", "vli_backend", "vli_mapping"])
+def test_every_module_stands_in_docs_architecture(package: str) -> None:
+    modules = {path.stem for path in (REPOSITORY / "src" / package / package).glob("*.py")} - {"__init__"}
+    named = set(CODE.findall(rows("architecture.md", 3)[package][1]))
+    assert {name for name in named if not name.endswith("/")} == modules
+
+
 @pytest.mark.parametrize("page", ["tuning.md", "conventions.md", "evaluation.md", "topics.md"])
 def test_parameters_named_in_the_docs_exist(page: str) -> None:
     known = {spec.name for spec in parameters(Settings)}

@@ -48,6 +48,7 @@ class _Costs:
 
     @contextmanager
     def measure(self, stage: str) -> Iterator[None]:
+        """Add the time of what runs within to a stage."""
         start = time.perf_counter()
         yield
         self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start

@@ -37,6 +37,7 @@ class _Parser(argparse.ArgumentParser):
     """Says what is wrong in one line, like every other error of the command."""
 
     def error(self, message: str) -> NoReturn:
+        """Leave with the message."""
         self.exit(EXIT_UNUSABLE, f"{self.prog}: {message}; see '{self.prog} --help'\n")
 
 

@@ -25,7 +25,7 @@ from numba import njit
 from vli_common.arrays import BoolArray, Float32Array, FloatArray, IntArray
 from vli_common.types import PointCloud
 from vli_mapping.light import Light
-from vli_mapping.normals import MAX_NEIGHBOURS
+from vli_mapping.normals import MAX_NEIGHBOURS, SPARSE
 from vli_mapping.point_map import PointMap, to_bytes
 from vli_mapping.ray_casting import cast, direct
 from vli_mapping.spatial_hash import SpatialHash, coordinates, neighbours
@@ -33,8 +33,6 @@ from vli_mapping.trusted_colours import from_afar
 
 _REACH = 2.0
 """Times the radius of the normals: the neighbourhood."""
-_SPARSE = 3
-"""One in so many points is a neighbour: those along a stripe say the same."""
 _SAME_FACE = float(np.cos(np.radians(40.0)))
 """Cosine between normals of one face: nearer than the flank of a key is to its top."""
 _NOISE = 2.0
@@ -175,7 +173,7 @@ class _Neighbourhood:
     """Points (N, 3) and those of them within a radius, metres, that count as neighbours."""
 
     def __init__(self, points: FloatArray, radius: float) -> None:
-        self._points, sparse = points, np.ascontiguousarray(points[::_SPARSE])
+        self._points, sparse = points, np.ascontiguousarray(points[::SPARSE])
         grid = SpatialHash.of(sparse, radius)
         self._around = (grid.heads, grid.next, grid.cell_m, sparse, radius)
 
@@ -227,7 +225,7 @@ def _average_normals(around, points, normals, mean, agreement):  # type: ignore[
         if has_own:
             known = 1
         for at in found[:count]:
-            n = coordinates(normals, _SPARSE * at)
+            n = coordinates(normals, SPARSE * at)
             if n[0] == 0 and n[1] == 0 and n[2] == 0:
                 continue
             known += 1
@@ -250,7 +248,7 @@ def _pool(around, points, normals, misfit, result):  # type: ignore[no-untyped-d
         count = neighbours(heads, following, sparse, coordinates(points, index), radius, cell_m, found)
         own, total, beside = coordinates(normals, index), np.log(misfit[index] + _LEAST_MISFIT), 1
         for found_at in found[:count]:
-            at = _SPARSE * found_at
+            at = SPARSE * found_at
             if at != index and _is_same_face(own, coordinates(normals, at)):
                 total += np.log(misfit[at] + _LEAST_MISFIT)
                 beside += 1
@@ -303,7 +301,7 @@ def _look_around(index, found, count, normals, shown, trust, face, all_around): 
     for channel in range(3):
         face[channel], all_around[channel] = colours[index, channel], 0.0
     for found_at in found[:count]:
-        at = _SPARSE * found_at
+        at = SPARSE * found_at
         if np.isnan(colours[at, 0]):
             continue
         trusts += trust[at]

@@ -15,7 +15,8 @@ from vli_mapping.spatial_hash import SpatialHash, coordinates, neighbours
 
 MAX_NEIGHBOURS = 192
 MIN_NEIGHBOURS = 6
-_SPARSE = 3
+SPARSE = 3
+"""One in so many points stands for all: pixels along a stripe are much closer than stripes are, and say the same."""
 _LINE = 0.02
 """λ₁/λ₂ below which a neighbourhood is more of a line: stripes less than some 0.1 mm apart, at a radius of 0.8 mm."""
 
@@ -31,8 +32,7 @@ def stripe_normals(
         radius: of the neighbourhood, metres.
         min_planarity: below it, and where only one scan is near, the normal is (0, 0, 0).
     """
-    # Every third point says as much of the plane: pixels along a stripe are much closer than stripes are.
-    sparse = np.concatenate([points[::_SPARSE], beside[::_SPARSE]])
+    sparse = np.concatenate([points[::SPARSE], beside[::SPARSE]])
     grid = SpatialHash.of(sparse, radius)
     normals, planarity = np.zeros((len(points), 3), np.float32), np.zeros(len(points), np.float32)
     which = np.arange(len(points))

@@ -13,13 +13,12 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from vli_common.arrays import Float32Array, FloatArray, IntArray
+from vli_mapping.normals import SPARSE
 
 _TRUSTED = 0.5
 """Trust from which on a colour is asked for, and needs none from afar."""
 _NEAREST, _REACH_M, _SOFTENED_M = 16, 0.02, 3e-4
 """How many are asked, how far away at most, and the distance within which all count alike."""
-_SPARSE = 3
-"""One in so many trusted points is asked: those along a stripe say the same."""
 _CHUNK = 1 << 17
 """Points that are looked up at a time."""
 
@@ -34,7 +33,7 @@ def from_afar(points: FloatArray, colours: Float32Array, trust: Float32Array) ->
     """
     result = np.full_like(colours, np.nan)
     known = ~np.isnan(colours[:, 0])
-    trusted = np.flatnonzero(known & (trust > _TRUSTED))[::_SPARSE]
+    trusted = np.flatnonzero(known & (trust > _TRUSTED))[::SPARSE]
     asking = np.flatnonzero(known & (trust <= _TRUSTED))
     if len(trusted) < _NEAREST:
         return result

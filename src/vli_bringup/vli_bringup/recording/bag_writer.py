@@ -114,6 +114,7 @@ class _WholeWrites:
         self._position = self._sound = 0
 
     def write(self, data: bytes) -> None:
+        """Write all of it, or raise."""
         left = memoryview(data)
         while left:
             written = os.write(self._descriptor, left)
@@ -121,21 +122,26 @@ class _WholeWrites:
             left = left[written:]
 
     def tell(self) -> int:
+        """Return how many bytes have been written."""
         return self._position
 
     def flush(self) -> None:
         """Nothing is held back."""
 
     def mark_sound(self) -> None:
+        """What has been written up to here is a file of its own."""
         self._sound = self._position
 
     def sync(self) -> None:
+        """Return once the disk has it all."""
         os.fsync(self._descriptor)
 
     def cut(self) -> None:
+        """Leave what is sound."""
         os.ftruncate(self._descriptor, self._sound)
 
     def close(self) -> None:
+        """Close the file; more than once does no harm."""
         descriptor, self._descriptor = self._descriptor, -1
         if descriptor >= 0:
             os.close(descriptor)
