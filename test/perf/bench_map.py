@@ -1,4 +1,4 @@
-"""Figures of the map alone: accuracy with true poses, and time, memory and the locks of a save against the size of the map.
+"""Figures of the map alone: accuracy with true poses; time, memory, locks of a save and colours against the size of the map.
 
 Run from the root of the workspace::
 
@@ -11,6 +11,7 @@ import argparse
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +29,10 @@ from vli_driver.config import DemuxConfig, StripeConfig
 from vli_driver.decode import decode
 from vli_driver.demux import Demultiplexer
 from vli_driver.scanner import StripeScanner
+from vli_mapping.albedo import albedo
 from vli_mapping.config import MappingConfig
 from vli_mapping.contradiction import contradict
+from vli_mapping.light import Light
 from vli_mapping.mapper import Mapper
 from vli_mapping.point_map import PointMap, Stripe
 from vli_mapping.snapshot import take
@@ -45,6 +48,9 @@ REST_S = 1.5
 SHEET, POINTS = 1000, 600
 """Points of a row of the synthetic sheet, and of a stripe that falls on a part of one."""
 SPACING_M = 2.5e-4
+LIGHT = Light(np.zeros(3), ambient=0.1, vignetting=(0.0, 0.2), reference_m=0.03)
+_RESET_PEAK = "5"
+"""Written to ``clear_refs``; see proc(5)."""
 
 
 @dataclass
@@ -184,13 +190,23 @@ def print_scaling(sizes: list[float]) -> None:
             target = point_map.insert(trusted)
             point_map.refine_normals(np.unique(target[target >= 0]), stripe.viewpoint)
             spent.append(1e3 * (time.perf_counter() - start))
-        resident = resident_mb()
+        resident = memory_mb("VmRSS")
         locks = save_locks(point_map)
         print(
             f"{len(point_map) / 1e6:.2f} million points: {np.median(spent):.3f} ms a stripe of {POINTS} (median), "
             f"{np.percentile(spent, 95):.3f} p95, {resident:.0f} MB resident; a save locks the map {len(locks)} times, "
             f"{np.median(locks):.2f} ms (median), {max(locks):.2f} at most"
         )
+        print_cost("colours of a file, each by its neighbourhood", len(point_map), partial(albedo, point_map, LIGHT))
+
+
+def print_cost(what: str, points: int, work: Callable[[], Any]) -> None:
+    """Print time and memory of some work on a map, per point."""
+    Path("/proc/self/clear_refs").write_text(_RESET_PEAK)
+    before, start = memory_mb("VmRSS"), time.perf_counter()
+    work()
+    spent, grown = time.perf_counter() - start, memory_mb("VmHWM") - before
+    print(f"  {what}: {1e6 * spent / points:.1f} µs a point, {1e3 * grown / points:.2f} kB a point beside the map at most")
 
 
 def save_locks(point_map: PointMap) -> list[float]:
@@ -231,10 +247,10 @@ def looking_down(centre: FloatArray) -> FloatArray:
     return T
 
 
-def resident_mb() -> float:
-    """Return the memory of this process."""
+def memory_mb(which: str) -> float:
+    """Return the memory of this process: ``VmRSS``, or ``VmHWM``, the most since the peak was reset."""
     for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith("VmRSS"):
+        if line.startswith(which):
             return int(line.split()[1]) / 1024
     return float("nan")
 
@@ -254,6 +270,8 @@ def main() -> None:
         timed = time_with_truth(args.data, calibration, 1e-3 * noise)
         print_times(timed)
         print_accuracy(timed.mapper, args.data)
+        photographs = len(timed.mapper.photographs())
+        print_cost(f"what {photographs} photographs say of colours", len(timed.mapper.map), timed.mapper.develop)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@
 
 Recordings are kept in ``--data`` and used again; the six passes take half an hour to make on two cores, the others two to six
 minutes. The recording of another generator in ``../shared/data`` is used where it is there. Starts in motion:
-`bench_starts.py`; time: `test_speed.py`.
+`bench_starts.py`; time: `bench_speed.py`.
 """
 
 from __future__ import annotations
