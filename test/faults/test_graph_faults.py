@@ -15,12 +15,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from graph_tools import NODES, demo_graph, is_linked, text, wait
+from graph_tools import NODES, demo_graph, is_linked, replay, text, wait
 
 from vli_bringup.graph import NodeDescription
 from vli_bringup.listener import LISTENER, GraphListener
 from vli_bringup.processes import NodeProcesses
-from vli_bringup.recorder import Recorder
 from vli_bringup.watch import GraphWatch
 from vli_common.calibration import load_calibration
 from vli_common.messages import cloud_from_message
@@ -35,13 +34,8 @@ _LOOP = {"driver_node": {"loop": True}}
 
 
 @pytest.fixture
-def recorder(demo: Path) -> Recorder:
-    return Recorder(load_calibration(demo / "calibration.yaml"))
-
-
-@pytest.fixture
-def listener(recorder: Recorder) -> Iterator[GraphListener]:
-    with GraphListener(recorder) as item:
+def listener(demo: Path) -> Iterator[GraphListener]:
+    with GraphListener(load_calibration(demo / "calibration.yaml")) as item:
         yield item
 
 
@@ -167,7 +161,7 @@ def slowed(pids: list[int], share: float, period_s: float = 0.1) -> Iterator[Non
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["demux_node", "frontend_node"])
 def test_a_node_that_is_too_slow_leaves_out_the_oldest_says_so_and_its_queues_stay_short(
-    demo: Path, parameter_file: Path, listener: GraphListener, recorder: Recorder, name: str
+    demo: Path, parameter_file: Path, listener: GraphListener, name: str
 ) -> None:
     with NodeProcesses(demo_graph(demo, _LOOP, rate=1.0, audience=LISTENER), parameter_file) as processes:
         wait(listener, lambda: text(listener, _BACK_END, "tracking") == "TRACKING", processes=processes)
@@ -175,7 +169,7 @@ def test_a_node_that_is_too_slow_leaves_out_the_oldest_says_so_and_its_queues_st
             wait(listener, lambda: "too slow: " in listener.statuses[name].hint, 60.0, processes)
             waiting = [value for key, value in listener.statuses[name].values.items() if key.startswith("waiting.")]
             assert max(map(int, waiting)) < 300
-        posed = len(recorder.live)
+        posed = listener.sessions.poses
         assert posed > 0
         wait(listener, lambda: text(listener, _BACK_END, "tracking") == "TRACKING", 60.0, processes)
 
@@ -211,11 +205,8 @@ def test_a_node_told_to_stop_at_any_moment_ends_with_code_0_and_no_traceback(dem
 @pytest.mark.parametrize("sign", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.slow)])
 def test_a_replay_told_to_stop_writes_what_it_has(demo: Path, tmp_path: Path, sign: signal.Signals) -> None:
     out = tmp_path / "out"
-    arguments = ["replay", str(demo / "bag"), "--calib", str(demo / "calibration.yaml"), "--out", str(out), "--rate", "0.3"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "vli_bringup.cli", *arguments], stderr=subprocess.PIPE, stdout=subprocess.PIPE
-    )
-    with GraphListener(Recorder(load_calibration(demo / "calibration.yaml"))) as listener:
+    process = replay(demo, out)
+    with GraphListener(load_calibration(demo / "calibration.yaml")) as listener:
         wait(listener, lambda: listener.value(_MAPPING, "points") > 500)
     code, errors = bounded_stop(process, sign)
     assert code == 0, errors

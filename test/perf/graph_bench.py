@@ -103,8 +103,12 @@ class Graph:
 
     processes: NodeProcesses
     listener: GraphListener
-    recorder: Recorder
     watch: GraphWatch
+
+    @property
+    def recorder(self) -> Recorder:
+        """Of the present session."""
+        return self.listener.sessions.recorder
 
     def wait(self, condition: Callable[[], bool], timeout_s: float = _START_S) -> float:
         """Spin until a condition holds; return the seconds that took.
@@ -175,12 +179,11 @@ def graph(
     parameter_file.write_text(to_yaml(Settings()))
     playback = Playback(recording.bag, rate, 0.0, duration_s)
     nodes = describe_graph(recording.calibration_path, playback=playback, audience=LISTENER)
-    recorder = Recorder(recording.calibration)
     with (
         NodeProcesses([_own(node, own or {}) for node in nodes], parameter_file) as processes,
-        GraphListener(recorder) as listener,
+        GraphListener(recording.calibration) as listener,
     ):
-        yield Graph(processes, listener, recorder, GraphWatch(processes))
+        yield Graph(processes, listener, GraphWatch(processes))
 
 
 def _own(node: NodeDescription, driver: Mapping[str, Any]) -> NodeDescription:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping
@@ -80,3 +82,21 @@ def is_linked(listener: GraphListener, newer_than_ns: int = 0) -> bool:
         and not any(status.values["unmatched"] for status in known)
         and len({status.values["session"] for status in known}) == 1
     )
+
+
+def replay(demo: Path, out: Path, *options: str) -> subprocess.Popen[bytes]:
+    """Start ``vli replay`` of the demo bag, slowly."""
+    arguments = ["replay", str(demo / "bag"), "--calib", str(demo / "calibration.yaml"), "--out", str(out), "--rate", "0.3"]
+    command_line = [sys.executable, "-m", "vli_bringup.cli", *arguments, *options]
+    return subprocess.Popen(command_line, stderr=subprocess.PIPE, stdout=subprocess.PIPE)
+
+
+def pid_of(process: subprocess.Popen[bytes], name: str) -> int:
+    """Return the process id of a node that a command has started, by way of the process that starts them; 0 while it is away."""
+    parents: dict[int, tuple[str, int]] = {}
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            head, _, rest = path.read_text().rpartition(")")
+            parents[int(path.parent.name)] = head.partition("(")[2], int(rest.split()[1])
+    server = [pid for pid, (_, parent) in parents.items() if parent == process.pid]
+    return next((pid for pid, (said, parent) in parents.items() if parent in server and said == name[:15]), 0)

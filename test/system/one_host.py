@@ -16,7 +16,6 @@ from graph_tools import demo_graph, text
 from vli_bringup.graph import SCANNER
 from vli_bringup.listener import GraphListener
 from vli_bringup.processes import NodeProcesses
-from vli_bringup.recorder import Recorder
 from vli_common.calibration import load_calibration
 
 _SAY_S = 0.5
@@ -28,8 +27,8 @@ def main() -> None:
     subprocess.run(["mount", "-t", "tmpfs", "tmpfs", "/dev/shm"], check=True)
     nodes = demo_graph(demo, {SCANNER: {"loop": True}})
     own = [node for node in nodes if (node.executable == SCANNER) == (role == "driver")]
-    recorder = Recorder(load_calibration(demo / "calibration.yaml"))
-    with NodeProcesses(own, parameter_file) as processes, GraphListener(recorder) as listener:
+    calibration = load_calibration(demo / "calibration.yaml")
+    with NodeProcesses(own, parameter_file) as processes, GraphListener(calibration) as listener:
         while True:
             until_s = time.monotonic() + _SAY_S
             while time.monotonic() < until_s:
@@ -42,7 +41,7 @@ def main() -> None:
                     listener.value("demux_node", f"received./camera/image_raw{suffix}") for suffix in ("", "/compressed")
                 ),
                 "tracking": text(listener, "backend_node", "tracking"),
-                "poses": len(recorder.live),
+                "poses": listener.sessions.poses,
                 "restarts": processes.restarts,
             }
             print(json.dumps(known), flush=True)

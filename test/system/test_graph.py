@@ -25,7 +25,6 @@ from vli_bringup.cli import main
 from vli_bringup.graph import SCANNER, NodeDescription, Playback, describe_graph
 from vli_bringup.listener import LISTENER, GraphListener
 from vli_bringup.processes import MAX_RESTARTS, GraphError, NodeProcesses
-from vli_bringup.recorder import Recorder
 from vli_common.calibration import load_calibration
 from vli_common.geometry import align
 from vli_common.messages import status_from_message
@@ -43,7 +42,7 @@ def calibration(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def listener(calibration: Path) -> Iterator[GraphListener]:
-    with GraphListener(Recorder(load_calibration(calibration))) as item:
+    with GraphListener(load_calibration(calibration)) as item:
         yield item
 
 

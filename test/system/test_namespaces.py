@@ -11,7 +11,6 @@ from tiny_bag import write_calibration
 
 from vli_bringup.graph import remappings
 from vli_bringup.listener import GraphListener
-from vli_bringup.recorder import Recorder
 from vli_common.calibration import load_calibration
 
 _UNKNOWN = "_NODE_NAMESPACE_UNKNOWN_"
@@ -22,7 +21,7 @@ pytestmark = pytest.mark.graph
 
 def test_scanners_in_namespaces_of_their_own_share_nothing_but_diagnostics(tmp_path: Path) -> None:
     calibration = write_calibration(tmp_path / "calibration.yaml")
-    with GraphListener(Recorder(load_calibration(calibration))) as listener:
+    with GraphListener(load_calibration(calibration)) as listener:
         node = listener.node
         processes = []
         for name in ("left", "right"):

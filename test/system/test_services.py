@@ -10,7 +10,6 @@ from graph_tools import NODES, demo_graph, text, wait
 
 from vli_bringup.listener import GraphListener
 from vli_bringup.processes import NodeProcesses
-from vli_bringup.recorder import Recorder
 from vli_common.calibration import load_calibration
 from vli_common.status import NodeState
 from vli_mapping.map_file import load_map
@@ -32,7 +31,7 @@ def test_services_of_a_running_scan(repository: Path, tmp_path: Path, parameter_
         "autosave_path": str(autosaved),
     }
     nodes = demo_graph(demo, {_DRIVER: {"loop": True}, _MAPPING: store})
-    listener = GraphListener(Recorder(load_calibration(demo / "calibration.yaml")))
+    listener = GraphListener(load_calibration(demo / "calibration.yaml"))
     with NodeProcesses(nodes, parameter_file) as processes, listener:
         wait(listener, lambda: listener.value(_MAPPING, "points") > 2000, processes=processes)
         # The driver is held: what follows is about one map, and the session does not end meanwhile.

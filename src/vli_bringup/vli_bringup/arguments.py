@@ -6,6 +6,7 @@ import argparse
 import math
 from pathlib import Path
 
+from vli_bringup.graph import AUTOSAVE_S
 from vli_bringup.settings import Settings, load_settings
 from vli_common.types import Mode
 from vli_driver.bag import BagTopics
@@ -50,6 +51,17 @@ def add_parameter_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--config", metavar="F", type=Path, help="parameters, in the form of config/vli.yaml")
     parser.add_argument("--set", metavar="STAGE.KEY=VALUE", action="append", default=[], help="one parameter; may be repeated")
+
+
+def add_autosave_argument(parser: argparse.ArgumentParser) -> None:
+    """Add how often the graph saves its map by itself."""
+    parser.add_argument(
+        "--autosave",
+        metavar="S",
+        type=_seconds,
+        default=AUTOSAVE_S,
+        help="save the map every S seconds, to go on with it after a crash; 0: never (default: %(default)g)",
+    )
 
 
 def add_topic_argument(parser: argparse.ArgumentParser) -> None:

@@ -43,6 +43,9 @@ class Playback:
     duration_s: float | None = None
 
 
+AUTOSAVE, AUTOSAVE_S = "autosave.vli", 30.0
+"""Name of mapping's automatic saves, beside where it saves when it is told to; how often the commands ask for one."""
+
 SCANNER = "driver_node"
 STAGES = (
     ("vli_driver", "demux_node"),
@@ -69,6 +72,7 @@ def describe_graph(
     imu_calibration: Path | None = None,
     playback: Playback | None = None,
     save_path: Path | None = None,
+    autosave_s: float = 0.0,
     audience: str | None = None,
     sensor: DriverConfig | None = None,
 ) -> list[NodeDescription]:
@@ -80,6 +84,7 @@ def describe_graph(
         imu_calibration: Kalibr's separate IMU file.
         playback: the bag to play; None for a graph that waits for a camera and an IMU.
         save_path: where mapping saves the map.
+        autosave_s: how often it saves it beside that by itself, to go on with after a crash; 0: never.
         audience: a node outside the graph that the playback waits for as well.
         sensor: topics of a camera and an IMU that are there; what plays a bag publishes under the names of the table.
     """
@@ -96,7 +101,7 @@ def describe_graph(
             "duration": playback.duration_s or 0.0,
             "wait_for": ",".join([*awaited, audience] if audience else awaited),
         }
-    own: dict[str, dict[str, Any]] = {"mapping_node": {"save_path": str(save_path.absolute())}} if save_path else {}
+    own: dict[str, dict[str, Any]] = {"mapping_node": _saves(save_path.absolute(), autosave_s)} if save_path else {}
     if sensor is not None and playback is None:
         image = sensor.image_topic.removesuffix("/compressed")
         own |= {
@@ -105,6 +110,11 @@ def describe_graph(
         }
     nodes = [NodeDescription("vli_driver", SCANNER, source, respawn=playback is None)]
     return nodes + [NodeDescription(package, name, {**shared, **own.get(name, {})}) for package, name in STAGES]
+
+
+def _saves(path: Path, autosave_s: float) -> dict[str, Any]:
+    automatic = {"autosave_s": autosave_s, "autosave_path": str(path.with_name(AUTOSAVE))} if autosave_s else {}
+    return {"save_path": str(path), **automatic}
 
 
 def remappings(namespace: str) -> list[tuple[str, str]]:

@@ -14,7 +14,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
 from launch import LaunchContext, LaunchDescription  # type: ignore[attr-defined]  # mypy finds our directory of that name
-from vli_bringup.graph import Playback, describe_graph, remappings, viewer_remappings
+from vli_bringup.graph import AUTOSAVE, AUTOSAVE_S, Playback, describe_graph, remappings, viewer_remappings
 from vli_bringup.processes import MAX_RESTARTS
 from vli_common.node import set_transport_profile
 from vli_common.topics import NAMESPACE
@@ -38,6 +38,7 @@ _COMMON: _Arguments = {
         NAMESPACE,
     ),
     "save_path": ("where mapping's ~/save writes the map", "map.ply"),
+    "autosave": (f"seconds between automatic saves of all of it, {AUTOSAVE} beside save_path; 0: never", f"{AUTOSAVE_S:g}"),
     "respawn": ("true: a node that ends is started again, three times at most; what plays a bag is not", "true"),
     "rviz": ("true: RViz as well, as it is set up for these topics", "false"),
 }
@@ -106,7 +107,13 @@ def _nodes(values: dict[str, str]) -> list[Node]:
     names: dict[str, Any] = {name: values[name] for name in _SENSOR if name in values}
     sensor = replace(DriverConfig(), **names) if names else None
     graph = describe_graph(
-        Path(values["calibration"]), Mode(values["mode"]), imu, playback, Path(values["save_path"]), sensor=sensor
+        Path(values["calibration"]),
+        Mode(values["mode"]),
+        imu,
+        playback,
+        Path(values["save_path"]),
+        float(values["autosave"]),
+        sensor=sensor,
     )
     files = [values["config"]] if values["config"] else []
     namespace, respawn = values["namespace"], values["respawn"].lower() in _TRUE

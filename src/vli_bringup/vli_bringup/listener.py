@@ -16,10 +16,12 @@ from rclpy.subscription import Subscription
 from std_srvs.srv import Trigger
 
 from vli_bringup.graph import SCANNER, STAGES
+from vli_bringup.graph_sessions import GraphSessions
 from vli_bringup.latency import FrameLatencies
 from vli_bringup.processes import GraphError
 from vli_bringup.recorder import Recorder
 from vli_common.arrays import FloatArray
+from vli_common.calibration import Calibration
 from vli_common.errors import MessageError
 from vli_common.geometry import inverse
 from vli_common.messages import (
@@ -45,21 +47,22 @@ _RECORDED = (POSE, WINDOW, ODOMETRY)
 
 
 class GraphListener:
-    """Collects what the nodes publish into a :class:`Recorder`; use as a context manager.
+    """Collects poses with their covariances, windows and states, session by session; use as a context manager.
 
     Args:
-        recorder: gets poses with their covariances, windows and states.
+        calibration: of the scanner.
         latencies: gets when poses came and when the driver's frames were due.
     """
 
-    def __init__(self, recorder: Recorder, latencies: FrameLatencies | None = None) -> None:
+    def __init__(self, calibration: Calibration, latencies: FrameLatencies | None = None) -> None:
         self.statuses: dict[str, StageStatus] = {}
         """The newest status of each node."""
         self.heard_s: dict[str, float] = {}
         """When that came, monotonic seconds."""
-        self._recorder = recorder
+        self.sessions = GraphSessions(calibration)
+        """What was recorded."""
         self._latencies = latencies or FrameLatencies()
-        self._poses: dict[int, FloatArray] = {}
+        self._poses: dict[int, tuple[Recorder, FloatArray]] = {}
         self._odometries: dict[int, Odometry] = {}
         self._received = Counters()
         self.malformed = Counters()
@@ -174,8 +177,9 @@ class GraphListener:
         self._received.add(POSE.name)
         stamp_ns, T_map_imu = pose_from_message(message)
         self._latencies.add_pose(stamp_ns, int(info["received_timestamp"]))
-        self._recorder.add_pose(stamp_ns, T_map_imu)
-        self._poses[stamp_ns] = T_map_imu
+        recorder = self.sessions.at(int(info["source_timestamp"]))
+        recorder.add_pose(stamp_ns, T_map_imu)
+        self._poses[stamp_ns] = recorder, T_map_imu
         self._join(stamp_ns)
 
     def _on_odometry(self, message: Odometry) -> None:
@@ -188,25 +192,27 @@ class GraphListener:
         """Record the covariance, which the odometry has about the axes of ``odom``, once the pose in ``map`` is there too."""
         if stamp_ns not in self._poses or stamp_ns not in self._odometries:
             return
-        T_map_imu, message = self._poses.pop(stamp_ns), self._odometries.pop(stamp_ns)
+        (recorder, T_map_imu), message = self._poses.pop(stamp_ns), self._odometries.pop(stamp_ns)
         T_odom_imu = odometry_from_message(message).T_map_imu
         estimate = odometry_from_message(message, T_map_imu @ inverse(T_odom_imu))
-        self._recorder.add_pose(stamp_ns, T_map_imu, estimate.covariance)
+        recorder.add_pose(stamp_ns, T_map_imu, estimate.covariance)
 
-    def _on_window(self, message: Any) -> None:
+    def _on_window(self, message: Any, info: dict[str, Any]) -> None:
         self._received.add(WINDOW.name)
-        self._recorder.add([window_from_message(message)])
+        self.sessions.at(int(info["source_timestamp"])).add([window_from_message(message)])
 
-    def _on_status(self, message: Any) -> None:
+    def _on_status(self, message: Any, info: dict[str, Any]) -> None:
         status = status_from_message(message)
         if status.node not in _NODES:
             return
         self.statuses[status.node], self.heard_s[status.node] = status, time.monotonic()
         if "due_stamp_ns" in status.values:
             self._latencies.add_due(int(status.values["due_stamp_ns"]), int(status.values["due_wall_ns"]))
-        if status.node == _BACK_END and "tracking" in status.values:
-            values = status.values
-            self._recorder.add_state(int(values["stamp_ns"]), TrackingState(values["tracking"]), values["reason"])
+        values = status.values
+        if status.node == _BACK_END:
+            self.sessions.begin(count_of(values.get("session", "0")), int(info["source_timestamp"]))
+        if status.node == _BACK_END and "tracking" in values:
+            self.sessions.recorder.add_state(int(values["stamp_ns"]), TrackingState(values["tracking"]), values["reason"])
 
 
 def count_of(text: str) -> int:

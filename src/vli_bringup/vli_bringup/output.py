@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import os
+import sys
 from datetime import datetime
 from pathlib import Path
+from types import TracebackType
 
 from vli_common.directories import NewDirectory
+from vli_common.errors import OutputError
+from vli_mapping.map_file import SUFFIX
 
 SUMMARY = "summary.json"
 CONFIG = "config.yaml"
@@ -33,6 +37,39 @@ class ResultsDirectory(NewDirectory):
         """Point ``results/latest`` at a directory of its own naming."""
         if self._is_default:
             _link(self.path)
+
+
+class ScanDirectory(ResultsDirectory):
+    """The results of a scan that nobody can make again: what there is of one that was cut off stays in ``DIR.partial``.
+
+    Raises:
+        OutputError: as for any results; and where what is left of such a scan is in the way.
+    """
+
+    def __init__(self, out: Path | None, overwrite: bool = False) -> None:
+        super().__init__(out, overwrite)
+        if not overwrite and (left := self._left()):
+            raise OutputError(
+                f"'{self.partial}' holds what is left of a scan that was cut off ({left}); rename it, choose another with "
+                "--out DIR, or replace it with --overwrite"
+            )
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        """Move what was written into place; where something failed, leave what there is of the scan, and say so."""
+        left = self._left() if kind is not None else ""
+        if not left:
+            super().__exit__(kind, error, trace)
+        elif isinstance(error, OSError):
+            raise OutputError(
+                f"results cannot be written to '{self.partial}' ({error.strerror or error}); what there is stays there: {left}"
+            ) from error
+        else:
+            sys.stderr.write(f"vli: what there is of the scan stays in '{self.partial}': {left}\n")
+
+    def _left(self) -> str:
+        """Return the names of maps and trajectories in ``DIR.partial``."""
+        found = [*self.partial.rglob(f"*{SUFFIX}"), *self.partial.rglob("*.tum")]
+        return ", ".join(sorted(str(path.relative_to(self.partial)) for path in found if path.stat().st_size))
 
 
 def _link(path: Path) -> None:

@@ -124,9 +124,14 @@ class NodeProcesses:
     def end(self, node: str, reason: str) -> None:
         """End a node that is not as it should be; :meth:`check` starts it again."""
         child = self._children[node]
-        if child.is_started and child.process.poll() is None:
+        if self.is_running(node):
             self._tell(f"{node} {reason}")
             child.process.send_signal(signal.SIGKILL)
+
+    def is_running(self, node: str) -> bool:
+        """Return False where a node has ended."""
+        child = self._children[node]
+        return child.is_started and child.process.poll() is None
 
     def forgive(self) -> None:
         """Count the crashes that end the graph anew, for who kills nodes on purpose."""

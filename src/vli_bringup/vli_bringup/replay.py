@@ -8,7 +8,7 @@ import time
 
 from tqdm import tqdm
 
-from vli_bringup.arguments import add_scan_arguments, bag_topics, number, source_settings
+from vli_bringup.arguments import add_autosave_argument, add_scan_arguments, bag_topics, number, source_settings
 from vli_bringup.graph import SCANNER, Playback
 from vli_bringup.graph_run import MAPPING, GraphOptions, RunningGraph, report, run_graph
 from vli_bringup.input_checks import check_input, check_part
@@ -26,11 +26,15 @@ _SILENT_S = 60.0
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``vli replay``."""
     add_scan_arguments(parser)
+    add_autosave_argument(parser)
     parser.add_argument("--rate", metavar="R", type=_rate, default=1.0, help="bag seconds a second (default: %(default)s)")
 
 
 def run(args: argparse.Namespace) -> int:
-    """Replay a bag and write the results; return 0, or 1 where tracking never started.
+    """Replay a bag and write the results.
+
+    Returns:
+        0; 1 where tracking never started; 2 where a node failed for good, and what there was by then is written.
 
     Raises:
         VliError: nothing usable: bag, calibration, parameters, output directory, or a node that failed.
@@ -42,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
     warnings = check_input(BagReader(args.bag, topics), calibration, mode.uses_imu)
     check_part(BagReader(args.bag, topics, args.start, args.duration))
     playback = Playback(args.bag, args.rate, args.start, args.duration)
-    options = GraphOptions(args.calib, args.imu_calib, calibration, settings, mode, playback)
+    options = GraphOptions(args.calib, args.imu_calib, calibration, settings, mode, playback, args.autosave)
     results = ResultsDirectory(args.out, args.overwrite)
     with results as directory:
         summary = run_graph(options, directory, args.started_s, _play)
@@ -51,28 +55,32 @@ def run(args: argparse.Namespace) -> int:
     return report(summary, results.path, "replay")
 
 
-def _play(graph: RunningGraph) -> tuple[float, float]:
+def _play(graph: RunningGraph) -> None:
     """Wait until the driver has begun, which it does when every node is ready and knows its neighbours; then until the end.
 
-    Returns:
-        When the first frame came (``time.perf_counter()``), and the bag seconds played until the last node had finished or all
-        were told to stop; a bar shows them on a terminal.
+    That is when the last node has finished, or all are told to stop. A bar shows the bag seconds on a terminal.
     """
     listener = graph.listener
     graph.wait_until(lambda: bool(listener.value(SCANNER, "position_ns")) or _has_finished(graph, SCANNER), SCANNER)
-    begin_s, moved_s = time.perf_counter(), time.monotonic()
+    graph.begin()
+    moved_s = time.monotonic()
     first_ns = last_ns = listener.value(SCANNER, "position_ns")
     with tqdm(unit="s", disable=not sys.stderr.isatty(), leave=False) as bar:
         while not _has_finished(graph, MAPPING) and not graph.stop.is_set():
             graph.spin()
             position_ns = listener.value(SCANNER, "position_ns")
-            if position_ns != last_ns:
+            if position_ns != last_ns or _is_paused(graph):
                 last_ns, moved_s = position_ns, time.monotonic()
             elif time.monotonic() - moved_s > _SILENT_S:
                 states = ", ".join(f"{name} {status.state.value}" for name, status in sorted(listener.statuses.items()))
                 raise GraphError(f"the graph has not moved for {_SILENT_S:g} s: {states}")
-            bar.update(max(0.0, round((last_ns - first_ns) / NANOSECONDS, 1) - bar.n))
-    return begin_s, (last_ns - first_ns) / NANOSECONDS
+            graph.data_s = (last_ns - first_ns) / NANOSECONDS
+            bar.update(max(0.0, round(graph.data_s, 1) - bar.n))
+
+
+def _is_paused(graph: RunningGraph) -> bool:
+    """Return True while someone has a node wait: that it does not move is no fault."""
+    return any(status.state in (NodeState.PAUSED, NodeState.INACTIVE) for status in graph.listener.statuses.values())
 
 
 def _has_finished(graph: RunningGraph, node: str) -> bool:

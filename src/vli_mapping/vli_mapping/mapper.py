@@ -112,6 +112,11 @@ class Mapper:
         return MappingOutput(constraints, cloud, update, relocalisation)
 
     @property
+    def session(self) -> int:
+        """Of the map."""
+        return self._window.session
+
+    @property
     def is_located(self) -> bool:
         """False while the window's place in the map is not known: after a loss, or in the map of an earlier session."""
         return self._whereabouts.is_known or not len(self.map)

@@ -71,7 +71,7 @@ def started(repository: Path, name: str, **given: str) -> list[Recorded]:
 
 def test_replay_starts_what_vli_replay_starts(repository: Path) -> None:
     nodes = started(repository, "replay.launch.py", bag="b", calibration="c.yaml", rate="0.5", mode="vi", config="vli.yaml")
-    expected = describe_graph(Path("c.yaml"), Mode.VI, None, Playback(Path("b"), 0.5), Path("map.ply"))
+    expected = describe_graph(Path("c.yaml"), Mode.VI, None, Playback(Path("b"), 0.5), Path("map.ply"), 30.0)
     got = [(item.options["package"], item.options["executable"], item.options["parameters"]) for item in nodes]
     assert got == [(node.package, node.executable, ["vli.yaml", dict(node.parameters)]) for node in expected]
 
@@ -120,7 +120,7 @@ def test_a_simulation_is_replayed_once_it_is_made(repository: Path) -> None:
     assert on_exit.options["target_action"] is simulator
     driver, *stages = on_exit.options["on_exit"](Recorded((), {"returncode": 0}), None)
     expected = describe_graph(
-        Path("scene/calibration.yaml"), playback=Playback(Path("scene/bag"), 0.5), save_path=Path("map.ply")
+        Path("scene/calibration.yaml"), playback=Playback(Path("scene/bag"), 0.5), save_path=Path("map.ply"), autosave_s=30.0
     )
     assert driver.options["parameters"] == [dict(expected[0].parameters)]
     assert len(stages) == 4

@@ -21,7 +21,7 @@ from vli_common.types import PoseEstimate
 @pytest.fixture
 def listener(repository: Path) -> GraphListener:
     calibration = load_calibration(repository / "bags/demo/calibration.yaml")
-    return GraphListener(Recorder(calibration))
+    return GraphListener(calibration)
 
 
 def status(node: str, **values: int) -> StageStatus:
@@ -64,13 +64,13 @@ def test_a_pose_is_recorded_with_the_covariance_of_its_odometry_whichever_comes_
     direct = Recorder(load_calibration(repository / "bags/demo/calibration.yaml"))
     for estimate in estimates[:2]:
         direct.add_pose(estimate.stamp_ns, T_map_imu, covariance)
-    info = {"received_timestamp": 0}
+    info = {"received_timestamp": 0, "source_timestamp": 0}
     listener._on_pose(pose_to_message(estimates[0]), info)
     listener._on_odometry(odometry_to_message(estimates[0]))
     listener._on_odometry(odometry_to_message(estimates[1]))
     listener._on_pose(pose_to_message(estimates[1]), info)
     listener._on_pose(pose_to_message(estimates[2]), info)
-    recorder = listener._recorder
+    recorder = listener.sessions.recorder
     assert list(recorder.live) == [10, 20, 30]
     assert list(recorder.covariances) == [10, 20]
     np.testing.assert_allclose(recorder.covariances[20], direct.covariances[20], atol=1e-15)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
 
-from vli_bringup.output import ResultsDirectory
+from vli_bringup.output import ResultsDirectory, ScanDirectory
 from vli_common.errors import OutputError
 
 
@@ -125,3 +126,37 @@ def test_without_a_name_results_are_stamped_and_latest_points_at_the_newest(tmp_
     assert re.fullmatch(r"results/\d{8}-\d{6}", str(ResultsDirectory(None).path))
     assert (tmp_path / "results" / "latest" / "summary.json").read_text() == "second"
     assert (tmp_path / "results" / "latest").readlink().name == "second"
+
+
+def cut_off(results: ResultsDirectory, error: BaseException, written: Mapping[str, str]) -> None:
+    """Write some files and fail."""
+    with results as directory:
+        for name, text in written.items():
+            (directory / name).parent.mkdir(exist_ok=True)
+            (directory / name).write_text(text)
+        raise error
+
+
+def test_a_scan_that_is_cut_off_stays_and_is_not_replaced_unasked(tmp_path, capsys):
+    with pytest.raises(KeyboardInterrupt):
+        cut_off(ScanDirectory(tmp_path / "out"), KeyboardInterrupt(), {"autosave.vli": "map"})
+    assert "what there is of the scan stays in" in capsys.readouterr().err
+    assert (tmp_path / "out.partial" / "autosave.vli").read_text() == "map"
+    with pytest.raises(OutputError, match=r"holds what is left of a scan that was cut off \(autosave.vli\); rename it"):
+        ScanDirectory(tmp_path / "out")
+    with ScanDirectory(tmp_path / "out", overwrite=True) as directory:
+        fill(directory)
+    assert [item.name for item in tmp_path.iterdir()] == ["out"]
+
+
+def test_a_full_disk_at_the_end_of_a_scan_does_not_cost_what_was_written_before(tmp_path):
+    written = {"trajectory.tum": "1", "a/map.vli": "1", "trajectory_final.tum": ""}
+    with pytest.raises(OutputError, match=r"No space left on device\); what there is stays there: a/map.vli, trajectory.tum$"):
+        cut_off(ScanDirectory(tmp_path / "out"), OSError(28, "No space left on device"), written)
+    assert (tmp_path / "out.partial" / "a" / "map.vli").exists()
+
+
+def test_a_scan_that_fails_before_anything_was_scanned_leaves_nothing(tmp_path):
+    with pytest.raises(OutputError, match="not ready"):
+        cut_off(ScanDirectory(tmp_path / "out"), OutputError("not ready"), {"config.yaml": "a: 1"})
+    assert list(tmp_path.iterdir()) == []

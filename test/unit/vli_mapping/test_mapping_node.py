@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import rclpy
+from mapping_scenes import sheet
+from patience import wait
 from rclpy.parameter import Parameter
 
-from vli_common.messages import image_to_cdr, scan_to_message, status_to_message
+from vli_common.calibration import Calibration, load_calibration
+from vli_common.messages import Session, image_to_cdr, scan_to_message, status_to_message
 from vli_common.node import inputs
 from vli_common.status import Health, NodeState, StageStatus
 from vli_common.topics import IMAGE_LONG, LASER_POINTS, MAP, STATUS
-from vli_common.types import Image, LaserScan
+from vli_common.types import Counters, Image, LaserScan
+from vli_mapping.map_file import load_map
 from vli_mapping.nodes.mapping_node import MappingNode
 
 BEHIND_S = 8
@@ -87,7 +92,7 @@ def test_a_node_that_is_stopped_lets_an_automatic_save_end_and_saves_what_came_s
     done = []
     monkeypatch.setattr(node, "_autosave", lambda: done.append("last"))
     assert node.set_parameters([Parameter("autosave_s", value=60.0)])[0].successful
-    node._mapper, node._is_resumed = SimpleNamespace(map=[0.0] * points), True
+    node._mapper, node._is_resumed = SimpleNamespace(map=[0.0] * points, session=1, counters=Counters()), True
     assert node._saving.acquire(blocking=False)
 
     def end() -> None:
@@ -127,3 +132,67 @@ def test_where_nobody_looks_no_light_is_sought(node, monkeypatch):
     node._mapper = SimpleNamespace(map=[])
     node._look_after_map()
     assert not node._lighting.locked()
+
+
+@pytest.fixture
+def calibration(repository: Path) -> Calibration:
+    return load_calibration(repository / "bags/demo/calibration.yaml")
+
+
+@pytest.fixture
+def saving(node: MappingNode, calibration: Calibration, tmp_path: Path) -> MappingNode:
+    """Return a node that saves by itself, ready, in session 3."""
+    values = {"autosave_s": 60.0, "autosave_path": str(tmp_path / "auto.vli")}
+    assert all(item.successful for item in node.set_parameters([Parameter(name, value=value) for name, value in values.items()]))
+    node.create_stage(calibration)
+    node.on_session(Session(3, "start"))
+    return node
+
+
+def files(directory: Path) -> list[str]:
+    return sorted(path.name for path in directory.iterdir())
+
+
+def test_the_map_of_a_session_that_ends_is_kept_whole_and_the_next_begins_empty(saving, tmp_path):
+    sheet(saving.mapper.map)
+    points = len(saving.mapper.map)
+    saving.on_session(Session(4, "the clock jumped"))
+    assert not len(saving.mapper.map)
+    kept = tmp_path / "auto_session-3.vli"
+    wait(kept.exists)
+    assert saving.close()
+    assert len(load_map(kept)) == points
+    assert files(tmp_path) == [kept.name]
+
+
+def test_parameters_that_take_effect_with_a_new_session_do_not_cost_the_map_before_it(saving, calibration, tmp_path):
+    sheet(saving.mapper.map)
+    saving.create_stage(calibration)
+    saving.on_session(Session(4, "reset"))
+    assert saving.close()
+    assert files(tmp_path) == ["auto_session-3.vli"]
+
+
+def test_a_session_in_which_nothing_was_mapped_leaves_no_file(saving, tmp_path):
+    saving.on_session(Session(4, "reset"))
+    assert saving.close()
+    assert files(tmp_path) == []
+
+
+def test_without_automatic_saves_a_session_that_ends_leaves_no_file(saving, tmp_path):
+    assert saving.set_parameters([Parameter("autosave_s", value=0.0)])[0].successful
+    sheet(saving.mapper.map)
+    saving.on_session(Session(4, "reset"))
+    assert saving.close()
+    assert files(tmp_path) == []
+
+
+def test_a_map_that_has_not_changed_since_is_not_saved_again(saving, monkeypatch, tmp_path):
+    monkeypatch.setattr(saving, "call", lambda job: job())
+    sheet(saving.mapper.map)
+    assert saving._has_more
+    assert saving._save_all(tmp_path / "map.vli") == len(saving.mapper.map)
+    assert not saving._has_more
+    sheet(saving.mapper.map, first_number=100)
+    saving.mapper.counters.add("scans_entered")
+    assert saving._has_more

@@ -139,11 +139,15 @@ class WorkingNode(ManagedNode):
 
         def answer(_: Trigger.Request, response: Trigger.Response) -> Any:
             job = partial(_answered, response, action)
-            return self._aside.run(job) if aside else job()
+            return self.do_aside(job) if aside else job()
 
         service = self.create_service(Trigger, f"~/{name}", answer)
         if aside:
             service.send_response = partial(_send_when_done, service.send_response)  # type: ignore[method-assign]
+
+    def do_aside(self, action: Callable[[], T]) -> Future[T]:
+        """Do what takes long in the thread of such services, which is given time to end when the node is stopped."""
+        return self._aside.run(action)
 
     def every(self, period_s: float, action: Callable[[], None]) -> None:
         """Run an action in the executor again and again, by the machine's own clock.

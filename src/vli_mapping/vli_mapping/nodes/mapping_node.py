@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,6 +12,7 @@ from pathlib import Path
 from sensor_msgs.msg import Image as ImageMessage
 
 from vli_common.calibration import Calibration
+from vli_common.camera import CameraModel
 from vli_common.config import parameter
 from vli_common.errors import OutputError, VliError
 from vli_common.messages import (
@@ -34,8 +35,8 @@ from vli_mapping.light import Light
 from vli_mapping.map_file import SUFFIX, load_map, map_origin, save_map
 from vli_mapping.mapper import Mapper
 from vli_mapping.mesh import make_mesh, write_mesh
-from vli_mapping.photographs import develop
-from vli_mapping.point_map import PointMap
+from vli_mapping.photographs import Photograph, develop
+from vli_mapping.point_map import PointMap, Stripe
 from vli_mapping.snapshot import Snapshot, restore, take, view
 from vli_mapping.warm_up import warm_up
 
@@ -60,7 +61,9 @@ class StoreConfig:
     autosave_s: float = parameter(
         0.0, unit="s", minimum=0.0, maximum=86400.0, doc="save the map to autosave_path this often; 0: never"
     )
-    autosave_path: str = parameter("autosave.vli", doc="file of the automatic saves: all of the map")
+    autosave_path: str = parameter(
+        "autosave.vli", doc="file of the automatic saves: all of the map; those of sessions that have ended get their number"
+    )
     reload_autosave: bool = parameter(
         True, doc="go on with the map in autosave_path where this node was started anew in the session that it is of"
     )
@@ -86,12 +89,14 @@ class MappingNode(VliNode):
         self._saving, self._lighting = threading.Lock(), threading.Lock()
         self.every(_AUTOSAVE_CHECK_S, self._look_after_autosave)
         self._autosaved_s = time.monotonic()
+        self._initial = self._saved = (0, 0, 0)
         self.every(_MAP_PERIOD_S, self._look_after_map)
 
     def create_stage(self, calibration: Calibration | None) -> None:
         """Make the mapper."""
         if calibration is not None:
             warm_up()
+            self._keep_map()
             self._mapper = Mapper(calibration, self.parameters.config(MappingConfig), self.mode)
 
     def drop_stage(self) -> None:
@@ -99,8 +104,10 @@ class MappingNode(VliNode):
         self._mapper = None
 
     def on_session(self, session: Session) -> None:
-        """Begin a map."""
+        """Begin a map; where maps are saved automatically, the one so far is kept."""
+        self._keep_map()
         self.mapper.reset(session.number)
+        self._initial = self._version
 
     def on_restart(self, node: str) -> None:
         """Begin a session where the back end begins a frame of its own: its poses do not belong to the map so far."""
@@ -198,10 +205,24 @@ class MappingNode(VliNode):
 
     def close(self) -> bool:
         """Save a last time where the map is saved automatically, then stop."""
-        has_more = self._is_resumed and self.parameters.config(StoreConfig).autosave_s and self._mapper and len(self._mapper.map)
-        if has_more and self._saving.acquire(timeout=_LAST_SAVE_S):
+        if (
+            self._is_resumed
+            and self.parameters.config(StoreConfig).autosave_s
+            and self._has_more
+            and self._saving.acquire(timeout=_LAST_SAVE_S)
+        ):
             self._autosave()
         return super().close()
+
+    @property
+    def _version(self) -> tuple[int, int, int]:
+        """Changes with the map: session, scans that have entered, points."""
+        return self.mapper.session, self.mapper.counters["scans_entered"], len(self.mapper.map)
+
+    @property
+    def _has_more(self) -> bool:
+        """True where the map has what neither the session began with nor the last file of all of it has."""
+        return self._mapper is not None and bool(len(self._mapper.map)) and self._version not in (self._initial, self._saved)
 
     @property
     def _origin(self) -> str:
@@ -217,7 +238,7 @@ class MappingNode(VliNode):
         In a thread of its own, and never two at a time.
         """
         config = self.parameters.config(StoreConfig)
-        is_due = time.monotonic() > self._autosaved_s + config.autosave_s and self._mapper is not None and len(self._mapper.map)
+        is_due = time.monotonic() > self._autosaved_s + config.autosave_s and self._has_more
         job = (self._autosave if is_due else None) if self._is_resumed else (self._resume_autosave if self._origin else None)
         if config.autosave_s and job and self._saving.acquire(blocking=False):
             threading.Thread(target=job, daemon=True).start()
@@ -245,8 +266,10 @@ class MappingNode(VliNode):
         self._autosaved_s = time.monotonic()
         path = self._path("autosave_path")
         try:
+            version = self.call(self._settled_version)
             snapshot = self._snapshot(path)
             save_map(path, replace(snapshot, origin=self._origin))
+            self._saved = version
         except VliError as error:
             self.get_logger().error(f"automatic save: {error}", throttle_duration_sec=60.0)
         finally:
@@ -254,9 +277,36 @@ class MappingNode(VliNode):
 
     def _save_all(self, path: Path) -> int:
         """Write all of the map; return how many points it has."""
+        version = self.call(self._settled_version)
         whole, light = self._finished(path)
         save_map(path, replace(view(whole, light), origin=self._origin))
+        self._saved = version
         return len(whole)
+
+    def _keep_map(self) -> None:
+        """Write the map of the session that ends where automatic saves go, in a thread: nobody changes it any more."""
+        mapper, autosave = self._mapper, self.parameters.config(StoreConfig).autosave_s
+        if mapper is None or not autosave or not len(mapper.map) or self._version == self._initial:
+            return
+        mapper.settle()
+        path = self._path("autosave_path")
+        path = path.with_stem(f"{path.stem}_session-{mapper.session}")
+        whole, fit, waiting, photographs = mapper.map, mapper.light_fit(), mapper.waiting(), mapper.photographs()
+
+        def write() -> None:
+            light = fit()
+            _complete(whole, light, mapper.camera, waiting, photographs)
+            try:
+                save_map(path, view(whole, light))
+                self.get_logger().info(f"keeps the map of the session that has ended as '{path}'")
+            except VliError as error:
+                self.get_logger().error(f"map of the session that has ended: {error}")
+
+        self.do_aside(write)
+
+    def _settled_version(self) -> tuple[int, int, int]:
+        self.mapper.settle()
+        return self._version
 
     def _finished(self, path: Path) -> tuple[PointMap, Light | None]:
         """Return a copy of the map as it were if the scan ended here, and the light on board.
@@ -267,11 +317,9 @@ class MappingNode(VliNode):
         waiting, photographs = self.call(self.mapper.waiting), self.call(self.mapper.photographs)
         snapshot = take(self.mapper.map, light, self.call)
         whole = restore(snapshot, self.parameters.config(MappingConfig).map)
-        for stripe in waiting:
-            whole.insert(stripe)
+        _complete(whole, light, self.mapper.camera, waiting, photographs)
         if not len(whole):
             raise OutputError(f"the map is empty, '{path}' is not written")
-        develop(whole, light, self.mapper.camera, photographs)
         return whole, light
 
     def _snapshot(self, path: Path) -> Snapshot:
@@ -295,6 +343,15 @@ class MappingNode(VliNode):
     def _clear(self) -> str:
         self.call(lambda: self.mapper.reset(self.session))
         return "the map is empty"
+
+
+def _complete(
+    whole: PointMap, light: Light | None, camera: CameraModel, waiting: Iterable[Stripe], photographs: Sequence[Photograph]
+) -> None:
+    """Give a map that nobody else changes what it would get if the scan ended here."""
+    for stripe in waiting:
+        whole.insert(stripe)
+    develop(whole, light, camera, photographs)
 
 
 def main() -> None:
