@@ -1,10 +1,9 @@
 """Colours for places around which no colour can be trusted: those of the nearest that can.
 
 A flank that the light grazes may be doubted over millimetres: its points have no normals, or the light on them is a guess, and
-so it is with their neighbours. They are then dark in one pass and bright in the next, as the light happens to fall; more than
-half of what two passes over a keyboard disagreed by lay in one point of a hundred, on such flanks. The parts of most things are
-larger than that and of one colour, so the nearest trusted points are the better guess: weighed by trust and inverse square
-distance (Shepard, "A two-dimensional interpolation function for irregularly-spaced data", 1968).
+so it is with their neighbours. They are then dark in one pass and bright in the next, as the light happens to fall. The parts of
+most things are larger than that and of one colour, so the nearest trusted points are the better guess: weighed by trust and
+inverse square distance (Shepard, "A two-dimensional interpolation function for irregularly-spaced data", 1968).
 """
 
 from __future__ import annotations
