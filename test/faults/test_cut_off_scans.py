@@ -8,19 +8,24 @@ import signal
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
+from bags import write_bag
 from graph_tools import START_S, pid_of, replay, wait
+from streams import Span, Stream, change, shift
 
 from vli_bringup.listener import GraphListener
 from vli_bringup.processes import MAX_RESTARTS
 from vli_bringup.tum import read_tum
 from vli_common import ply
 from vli_common.calibration import load_calibration
+from vli_common.types import NANOSECONDS
 from vli_mapping.map_file import load_map
 
 pytestmark = pytest.mark.graph
 
 _MAPPING, _BACK_END = "mapping_node", "backend_node"
+JUMP_S = 2.5
 
 
 def test_a_node_that_crashes_again_and_again_ends_the_replay_and_costs_nothing_that_was_scanned(
@@ -72,3 +77,19 @@ def test_a_back_end_that_crashes_costs_neither_path_nor_map_of_before(demo: Path
         assert len(ply.read_cloud(path / "map.ply").points) > points
     assert f"{len(before) + len(after)} poses of".encode() in said
     assert not list(out.glob("autosave*"))
+
+
+def test_f13_a_clock_that_jumps_costs_neither_path_nor_map_of_before(demo: Path, first_part: Stream, tmp_path: Path) -> None:
+    jumped = change(first_part, Span(JUMP_S).mask(first_part), lambda item: shift(item, -10 * NANOSECONDS))
+    out = tmp_path / "out"
+    process = replay(demo, out, bag=write_bag(tmp_path / "bag", jumped))
+    _, told = process.communicate(timeout=START_S)
+    assert process.returncode == 0, told.decode()
+    assert f"what was scanned in it is in '{out / 'session-1'}'".encode() in told
+    last = read_tum(out / "trajectory.tum").stamps_ns
+    assert np.all(np.diff(last) > 0)
+    assert last[0] < read_tum(out / "session-1" / "trajectory.tum").stamps_ns[0]
+    for path in (out, out / "session-1"):
+        assert len(read_tum(path / "trajectory_final.tum")) > 20
+        assert len(ply.read_cloud(path / "map.ply").points) > 3000
+        assert len(load_map(path / "map.vli")) > 3000

@@ -84,9 +84,18 @@ def is_linked(listener: GraphListener, newer_than_ns: int = 0) -> bool:
     )
 
 
-def replay(demo: Path, out: Path, *options: str) -> subprocess.Popen[bytes]:
-    """Start ``vli replay`` of the demo bag, slowly."""
-    arguments = ["replay", str(demo / "bag"), "--calib", str(demo / "calibration.yaml"), "--out", str(out), "--rate", "0.3"]
+def replay(demo: Path, out: Path, *options: str, bag: Path | None = None) -> subprocess.Popen[bytes]:
+    """Start ``vli replay`` of the demo bag, or another of that scanner, slowly."""
+    arguments = [
+        "replay",
+        str(bag or demo / "bag"),
+        "--calib",
+        str(demo / "calibration.yaml"),
+        "--out",
+        str(out),
+        "--rate",
+        "0.3",
+    ]
     command_line = [sys.executable, "-m", "vli_bringup.cli", *arguments, *options]
     return subprocess.Popen(command_line, stderr=subprocess.PIPE, stdout=subprocess.PIPE)
 

@@ -125,18 +125,18 @@ class RunningGraph:
         """Have the map saved, of a graph that is cut short with the window, as at the end of the bag; return what went wrong."""
         problems = []
         if is_cut_short and self._processes.is_running(_BACK_END):
-            problems.append(self._call(f"{_BACK_END}/pause", _PAUSE_S))
+            problems.append(self._call(_BACK_END, "pause", _PAUSE_S))
             deadline_s = time.monotonic() + _PAUSE_S
             while not problems[0] and self.listener.state(_BACK_END) is not NodeState.PAUSED and time.monotonic() < deadline_s:
                 self.listener.spin()
         if self._processes.is_running(MAPPING) and self.listener.value(MAPPING, "points"):
-            problems.append(self._call(f"{MAPPING}/save", _SAVE_S))
+            problems.append(self._call(MAPPING, "save", _SAVE_S))
         return [text for text in problems if text]
 
-    def _call(self, service: str, timeout_s: float) -> str:
+    def _call(self, node: str, service: str, timeout_s: float) -> str:
         """Call a service and return what went wrong: that must not cost what has been recorded so far."""
         try:
-            self.listener.call(service, timeout_s)
+            self.listener.call(f"{node}/{service}", timeout_s, lambda: self._processes.is_running(node))
         except GraphError as error:
             return str(error)
         return ""

@@ -126,8 +126,13 @@ class GraphListener:
         missed = {f"{LISTENER}.{topic.name}": sent.get(topic.name, 0) - self._received[topic.name] for topic in _RECORDED}
         return lost | {name: count for name, count in missed.items() if count > 0}
 
-    def call(self, service: str, timeout_s: float) -> str:
+    def call(self, service: str, timeout_s: float, is_there: Callable[[], bool] = lambda: True) -> str:
         """Call ``node/service`` (std_srvs/Trigger) and return its answer.
+
+        Args:
+            service: of any node.
+            timeout_s: for the answer.
+            is_there: False once the node has ended; no answer is waited for then.
 
         Raises:
             GraphError: no answer in time, or a refusal.
@@ -135,10 +140,10 @@ class GraphListener:
         client = self.node.create_client(Trigger, service)
         future = client.call_async(Trigger.Request())
         deadline_s = time.monotonic() + timeout_s
-        while not future.done() and time.monotonic() < deadline_s:
+        while not future.done() and time.monotonic() < deadline_s and is_there():
             self.spin()
         if not future.done():
-            raise GraphError(f"service '{service}' gave no answer in {timeout_s:g} s")
+            raise GraphError(f"service '{service}' gave no answer " + (f"in {timeout_s:g} s" if is_there() else "any more"))
         response = future.result()
         if not response.success:
             raise GraphError(f"service '{service}' refused: {response.message}")

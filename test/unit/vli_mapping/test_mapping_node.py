@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rclpy
-from mapping_scenes import sheet
+from mapping_scenes import sheet, stripe
 from patience import wait
 from rclpy.parameter import Parameter
 
@@ -163,6 +163,16 @@ def test_the_map_of_a_session_that_ends_is_kept_whole_and_the_next_begins_empty(
     assert saving.close()
     assert len(load_map(kept)) == points
     assert files(tmp_path) == [kept.name]
+
+
+def test_scans_of_the_window_that_ends_with_its_session_are_kept_too(saving, monkeypatch, tmp_path):
+    x = 3e-4 * np.arange(40)
+    left = [stripe(np.stack([x, np.full_like(x, 3e-4 * row), np.zeros_like(x)], axis=1), row) for row in range(20)]
+    monkeypatch.setattr(saving.mapper, "waiting", lambda: left)
+    saving.on_session(Session(4, "the clock jumped"))
+    assert saving.close()
+    assert len(load_map(tmp_path / "auto_session-3.vli")) > 0
+    assert not len(saving.mapper.map)
 
 
 def test_parameters_that_take_effect_with_a_new_session_do_not_cost_the_map_before_it(saving, calibration, tmp_path):

@@ -285,13 +285,18 @@ class MappingNode(VliNode):
 
     def _keep_map(self) -> None:
         """Write the map of the session that ends where automatic saves go, in a thread: nobody changes it any more."""
-        mapper, autosave = self._mapper, self.parameters.config(StoreConfig).autosave_s
-        if mapper is None or not autosave or not len(mapper.map) or self._version == self._initial:
+        mapper = self._mapper
+        if mapper is None or not self.parameters.config(StoreConfig).autosave_s:
             return
         mapper.settle()
+        waiting = mapper.waiting()
+        if not waiting and (self._version == self._initial or not len(mapper.map)):
+            return
         path = self._path("autosave_path")
         path = path.with_stem(f"{path.stem}_session-{mapper.session}")
-        whole, fit, waiting, photographs = mapper.map, mapper.light_fit(), mapper.waiting(), mapper.photographs()
+        # The mapper goes on with a map in which there is nothing.
+        whole = mapper.map if len(mapper.map) else PointMap(mapper.config.map)
+        fit, photographs = mapper.light_fit(), mapper.photographs()
 
         def write() -> None:
             light = fit()
