@@ -87,6 +87,15 @@ def test_a_node_that_hears_nothing_of_what_another_sends_says_so_until_it_does(n
     assert "cut off" not in said[-1].hint
 
 
+def test_a_node_whose_stage_has_failed_leaves_the_last_save_as_it_is(saving, tmp_path):
+    saving._is_resumed = True
+    sheet(saving.mapper.map)
+    assert saving._has_more
+    saving.fail(RuntimeError("broken"))
+    assert saving.close()
+    assert files(tmp_path) == []
+
+
 @pytest.mark.parametrize(("points", "saves"), [(1, ["under way", "last"]), (0, ["under way"])])
 def test_a_node_that_is_stopped_lets_an_automatic_save_end_and_saves_what_came_since(node, monkeypatch, points, saves):
     done = []

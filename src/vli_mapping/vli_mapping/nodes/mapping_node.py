@@ -205,12 +205,8 @@ class MappingNode(VliNode):
 
     def close(self) -> bool:
         """Save a last time where the map is saved automatically, then stop."""
-        if (
-            self._is_resumed
-            and self.parameters.config(StoreConfig).autosave_s
-            and self._has_more
-            and self._saving.acquire(timeout=_LAST_SAVE_S)
-        ):
+        is_asked = self._is_resumed and self.parameters.config(StoreConfig).autosave_s
+        if is_asked and self._has_more and self._saving.acquire(timeout=_LAST_SAVE_S):
             self._autosave()
         return super().close()
 
@@ -221,8 +217,13 @@ class MappingNode(VliNode):
 
     @property
     def _has_more(self) -> bool:
-        """True where the map has what neither the session began with nor the last file of all of it has."""
-        return self._mapper is not None and bool(len(self._mapper.map)) and self._version not in (self._initial, self._saved)
+        """True where the map has what neither the session began with nor the last file of all of it has.
+
+        Not after a failure: nobody knows whether the map is sound, and the last save is.
+        """
+        if self._mapper is None or self.failure is not None or not len(self._mapper.map):
+            return False
+        return self._version not in (self._initial, self._saved)
 
     @property
     def _origin(self) -> str:
