@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import cast
 
@@ -106,7 +107,7 @@ class WindowEstimator:
         self._tracker.set_keyframe(first.stamp_ns, state)
         self._covariance = PoseCovariance(self._T_imu_cam, config.covariance_scale)
         self._covariance.set_keyframe(first.stamp_ns, state.T_map_imu, self._smoother.newest_covariance())
-        self._measure_depths()
+        self._measure_depths(0)
         self._points = self._landmarks.points(self._keyframe_poses())
 
     @property
@@ -178,9 +179,17 @@ class WindowEstimator:
         self._scale = ratio, sigma
 
     def add_start_keyframe(
-        self, tracks: Tracks, state: KeyframeState, imu: gtsam.PreintegratedCombinedMeasurements | None
+        self,
+        tracks: Tracks,
+        state: KeyframeState,
+        imu: gtsam.PreintegratedCombinedMeasurements | None,
+        between: Sequence[FrameRecord] = (),
     ) -> None:
-        """Append a keyframe whose state a start in motion has found; :meth:`finish_start` solves them together."""
+        """Append a keyframe whose state a start in motion has found, and the frames since the last one.
+
+        :meth:`finish_start` solves them together.
+        """
+        self._records.extend(between)
         self._records.append(FrameRecord(tracks.stamp_ns, state.T_map_imu @ self._T_imu_cam, tracks.stationary))
         self._append_keyframe(tracks, state, imu)
         self._state = state
@@ -189,6 +198,7 @@ class WindowEstimator:
         """Solve the window of a start in motion; ``scale_sigma``: how well its scale is known, relative, where no laser tells."""
         if scale_sigma is not None:
             self._smoother.hold_scale(1.0, scale_sigma)
+        self._measure_depths(0)
         covariance, _ = self._solve(self._config.start_iterations)
         self._records = [
             FrameRecord(self._window.stamps[-1], self._state.T_map_imu @ self._T_imu_cam, self._window.stationary[-1])
@@ -279,7 +289,8 @@ class WindowEstimator:
         Returns:
             Covariance (6, 6) of the newest pose; why the solver failed at first, if it did: what it knew is kept.
         """
-        self._measure_depths()
+        # The one before the newest lacked the scans after it.
+        self._measure_depths(len(self._window) - 2)
         self._map = self.constraints
         condenser, problem = self._condenser(self._landmarks.usable, range(len(self._window.intervals))), ""
         try:
@@ -344,15 +355,22 @@ class WindowEstimator:
         self._window.drop_oldest()
         self._points = self._landmarks.points(self._keyframe_poses())
 
-    def _measure_depths(self) -> None:
-        """Give the features of the two newest keyframes their laser depth, eq. (2): the newest lacks the scans after it."""
-        poses = self._keyframe_poses()
-        for slot in range(max(0, len(self._window) - 2), len(self._window)):
-            stripes = self._window.near_scans(slot, poses, round(self._config.depth_window_s * 1e9))
-            if slot == len(self._window) - 1 and not stripes and self._scans:
-                stripes = [(poses[slot], self._scans[-1])] if len(self._window) == 1 else []
+    def _measure_depths(self, first: int) -> None:
+        """Give the features of the keyframes from slot ``first`` on their laser depth, eq. (2)."""
+        poses, near_ns = self._keyframe_poses(), round(self._config.depth_window_s * 1e9)
+        for slot in range(max(0, first), len(self._window)):
+            stripes = self._window.near_scans(slot, poses, near_ns) or self._nearest_to_only_keyframe(poses[0], near_ns)
             if stripes:
                 measure_slot(self._landmarks, slot, poses[slot], stripes, self._camera.focal_px, self._config)
+
+    def _nearest_to_only_keyframe(self, T_map_camera: FloatArray, near_ns: int) -> list[tuple[FloatArray, LaserScan]]:
+        """Return the pose of a window's only keyframe with the nearest stripe, as if taken there; at rest, any is."""
+        if len(self._window) > 1 or not self._scans:
+            return []
+        stamp_ns = self._window.stamps[0]
+        nearest = min(self._scans, key=lambda scan: abs(scan.stamp_ns - stamp_ns))
+        is_near = self._window.stationary[0] or abs(nearest.stamp_ns - stamp_ns) <= near_ns
+        return [(T_map_camera, nearest)] if is_near else []
 
     @property
     def _on_map(self) -> bool:

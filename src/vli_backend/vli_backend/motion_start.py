@@ -19,7 +19,7 @@ from vli_backend.window import FrameRecord, Window, close_interval
 from vli_common.arrays import FloatArray
 from vli_common.calibration import Calibration
 from vli_common.camera import CameraModel
-from vli_common.geometry import pose
+from vli_common.geometry import interpolate, pose
 from vli_common.types import LaserScan, Tracks
 
 _ROUNDS = 3
@@ -30,9 +30,15 @@ _MIN_DEPTHS = 4
 
 @dataclass(frozen=True)
 class Structure:
-    """IMU poses (K, 4, 4) in a world that is the first camera's; ``problem`` says why there are none."""
+    """Poses in a world that is the first camera's; ``problem`` says why there are none.
+
+    Args:
+        T_world_imu: (K, 4, 4), of the keyframes.
+        between: K − 1 arrays (M, 4, 4) ``T_world_camera`` of the frames between two of them.
+    """
 
     T_world_imu: FloatArray
+    between: list[FloatArray]
     problem: str = ""
 
 
@@ -40,15 +46,17 @@ def structure_from_motion(
     calibration: Calibration,
     config: BackEndConfig,
     tracks: list[Tracks],
+    between: list[list[Tracks]],
     imu: list[gtsam.PreintegratedCombinedMeasurements],
     scans: list[LaserScan],
 ) -> Structure:
-    """Return metric keyframe poses from tracks, gyro rotations and stripes.
+    """Return metric poses from tracks, gyro rotations and stripes.
 
     Args:
         calibration: camera, IMU, laser.
         config: parameters.
         tracks: of the K keyframes.
+        between: K − 1 lists, of the frames after a keyframe, up to and with the next one.
         imu: the K − 1 preintegrations between them (only their rotations are used).
         scans: stripes taken meanwhile.
     """
@@ -57,9 +65,7 @@ def structure_from_motion(
     rotations = chain_rotations(list(imu), T_cam_imu)
     parallax = parallax_px(tracks, rotations, focal)
     if parallax < config.start_parallax_px:
-        return Structure(
-            np.empty((0, 4, 4)), f"{parallax:.0f} px of parallax, {config.start_parallax_px:.0f} are needed: move sideways"
-        )
+        return _failed(f"{parallax:.0f} px of parallax, {config.start_parallax_px:.0f} are needed: move sideways")
     table = LandmarkTable(max(len(tracks), 2))
     guess = 1.0 / float(np.median(np.concatenate([scan.points[:, 2] for scan in scans])))
     limits = (guess / 6.0, guess * 6.0)
@@ -75,8 +81,13 @@ def structure_from_motion(
         measured = _measure(table, config, tracks, poses, scans, focal)
         poses, _ = bundle_adjust(linearise, poses, config.start_iterations)
     if measured < _MIN_DEPTHS:
-        return Structure(np.empty((0, 4, 4)), f"{measured} features near the stripe, {_MIN_DEPTHS} are needed")
-    return Structure(poses @ T_cam_imu)
+        return _failed(f"{measured} features near the stripe, {_MIN_DEPTHS} are needed")
+    inner = [frame_poses(config, table, poses, k, tracks[k], frames, calibration.camera) for k, frames in enumerate(between)]
+    return Structure(poses @ T_cam_imu, inner)
+
+
+def _failed(problem: str) -> Structure:
+    return Structure(np.empty((0, 4, 4)), [], problem)
 
 
 def parallax_px(tracks: list[Tracks], rotations: FloatArray, focal_px: float) -> float:
@@ -121,6 +132,40 @@ def chain_keyframes(
         table.add_keyframe(track.ids, track.rays, white, np.zeros(len(track), np.bool_), guess)
         refine(table.arrays, np.stack(poses), table.usable, config.cauchy, limits)
     return np.stack(poses)
+
+
+def frame_poses(
+    config: BackEndConfig,
+    table: LandmarkTable,
+    poses: FloatArray,
+    k: int,
+    keyframe: Tracks,
+    frames: list[Tracks],
+    camera: CameraModel,
+) -> FloatArray:
+    """Return camera poses (M, 4, 4) of frames between keyframes k and k + 1, by PnP on the landmarks.
+
+    Args:
+        config: parameters.
+        table: of the landmarks.
+        poses: (K, 4, 4), of the keyframes.
+        k: before the frames.
+        keyframe: tracks of keyframe k.
+        frames: M of them, and the next keyframe's.
+        camera: that took them.
+    """
+    *inner, following = frames
+    points = table.all_points(poses)
+    prior = np.diag(np.repeat([0.02**-2, float(np.median(table.arrays.rho)) ** 2], 3))
+    found = np.empty((len(inner), 4, 4))
+    for at, tracks in enumerate(inner):
+        _, rows, columns = np.intersect1d(points.ids, tracks.ids, return_indices=True)
+        white = whitening(camera, tracks, config.pixel_sigma)[columns]
+        share = (tracks.stamp_ns - keyframe.stamp_ns) / (following.stamp_ns - keyframe.stamp_ns)
+        predicted = interpolate(poses[k], poses[k + 1], share)
+        spread, rays = points.spread[rows], tracks.rays[columns]
+        found[at] = solve_frame_pose(predicted, prior, points.positions[rows], spread, rays, white, config.cauchy).T_map_camera
+    return found
 
 
 def _measure(

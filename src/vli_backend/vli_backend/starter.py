@@ -15,8 +15,9 @@ from vli_backend.initialisation import GRAVITY, align_imu, apply_alignment, rest
 from vli_backend.motion_start import structure_from_motion
 from vli_backend.smoother import KeyframeState, StatePrior
 from vli_backend.visual_start import start_from_vision
+from vli_backend.window import FrameRecord
 from vli_common.calibration import Calibration
-from vli_common.geometry import pose, so3_exp
+from vli_common.geometry import inverse, pose, so3_exp
 from vli_common.types import FrontEndOutput, LaserScan, Mode, Preintegration, Tracks
 
 _SCAN_MEMORY_NS = 4_000_000_000
@@ -26,6 +27,8 @@ _RETRY_NS = 250_000_000
 _WORST_SCALE = 0.15
 """Relative sigma of the scale beyond which no patience starts a window."""
 _FRAMES_WITHOUT_IMU = 5
+_MOST_BETWEEN = 300
+"""Frames that are kept between two keyframes, ten seconds: who waits at rest for a laser waits for any time."""
 _VISUAL_WINDOWS = 3
 """Window lengths over which a start without laser compares images and IMU: the longer, the better it knows the scale."""
 
@@ -87,9 +90,9 @@ class Starter:
         return None
 
     def _keep(self, frame: FrontEndOutput) -> None:
-        """Store a keyframe, and without the laser every frame: the IMU is compared with all of them."""
+        """Store a keyframe, and the frames between two: what stripes show is placed by them, and the IMU compared with them."""
         if not frame.tracks.keyframe:
-            if self._mode is Mode.VI and self._between and frame.preintegration is not None:
+            if self._between and frame.preintegration is not None and len(self._between[-1]) < _MOST_BETWEEN:
                 self._between[-1].append(frame)
             return
         if self._keyframes and not self._connected(frame):
@@ -120,7 +123,8 @@ class Starter:
         return None
 
     def _start_at_rest(self, frame: FrontEndOutput, place: DeadReckoning) -> WindowEstimator | None:
-        first = self._keyframes[-1].tracks
+        # Without IMU nothing tells the motion since the keyframe: the window of a scanner that moves begins here.
+        first = frame.tracks if self._moved else self._keyframes[-1].tracks
         if not self._mode.uses_imu:
             self.reason = "started without IMU"
             return self._estimator(first, KeyframeState(place.at(first.stamp_ns), np.zeros(3), np.zeros(3), np.zeros(3)), 0.05)
@@ -140,7 +144,8 @@ class Starter:
             return None
         tracks = [frame.tracks for frame in self._keyframes]
         imu = [pim for frame in self._keyframes[1:] if (pim := _measurements(frame.preintegration)) is not None]
-        structure = structure_from_motion(self._calibration, config, tracks, imu, self._scans)
+        between = [[item.tracks for item in interval] for interval in self._between[:-1]]
+        structure = structure_from_motion(self._calibration, config, tracks, between, imu, self._scans)
         if structure.problem:
             self.reason = f"in motion, {structure.problem}"
             return None
@@ -150,8 +155,11 @@ class Starter:
             return None
         states = _placed(apply_alignment(structure.T_world_imu, alignment), place, tracks[0].stamp_ns)
         estimator = self._estimator(tracks[0], states[0], 0.1)
-        for track, state, pim in zip(tracks[1:], states[1:], imu, strict=True):
-            estimator.add_start_keyframe(track, state, pim)
+        T_map_world = states[0].T_map_imu @ inverse(structure.T_world_imu[0])
+        for k, (track, state, pim) in enumerate(zip(tracks[1:], states[1:], imu, strict=True)):
+            inner = zip(between[k][:-1], T_map_world @ structure.between[k], strict=True)
+            records = [FrameRecord(item.stamp_ns, T_map_camera, item.stationary) for item, T_map_camera in inner]
+            estimator.add_start_keyframe(track, state, pim, records)
         estimator.finish_start()
         self.reason = "started in motion"
         return estimator

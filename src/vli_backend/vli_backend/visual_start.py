@@ -13,7 +13,6 @@ import numpy as np
 
 from vli_backend.condense import Quadratic, condense, refine
 from vli_backend.config import BackEndConfig
-from vli_backend.frame_pose import solve_frame_pose
 from vli_backend.inertial_alignment import (
     GRAVITY,
     AlignmentSigmas,
@@ -23,14 +22,13 @@ from vli_backend.inertial_alignment import (
 )
 from vli_backend.initialisation import bundle_adjust, chain_rotations
 from vli_backend.landmarks import LandmarkTable
-from vli_backend.motion_start import chain_keyframes, parallax_px
+from vli_backend.motion_start import chain_keyframes, frame_poses, parallax_px
 from vli_backend.preintegrations import measurements_of
 from vli_backend.smoother import KeyframeState
-from vli_backend.track_noise import whitening
 from vli_common.arrays import FloatArray
 from vli_common.calibration import Calibration
 from vli_common.camera import CameraModel
-from vli_common.geometry import interpolate, inverse, pose, rotation_between
+from vli_common.geometry import inverse, pose, rotation_between
 from vli_common.types import FrontEndOutput, Tracks
 
 _VISUAL_ROTATION_RAD = 5e-4
@@ -121,20 +119,8 @@ def _interval(
     camera: CameraModel,
 ) -> VisualInterval:
     """Return the frames between keyframes k and k + 1 with poses from the landmarks."""
-    points = table.all_points(poses)
-    span = frames[-1].tracks.stamp_ns - keyframe.stamp_ns
-    prior = np.diag(np.repeat([0.02**-2, float(np.median(table.arrays.rho)) ** 2], 3))
-    found: list[FloatArray] = []
-    for frame in frames[:-1]:
-        tracks = frame.tracks
-        _, rows, columns = np.intersect1d(points.ids, tracks.ids, return_indices=True)
-        white = whitening(camera, tracks, config.pixel_sigma)[columns]
-        predicted = interpolate(poses[k], poses[k + 1], (tracks.stamp_ns - keyframe.stamp_ns) / span)
-        solved = solve_frame_pose(
-            predicted, prior, points.positions[rows], points.spread[rows], tracks.rays[columns], white, config.cauchy
-        )
-        found.append(solved.T_map_camera)
-    T = np.stack([*found, poses[k + 1]])
+    found = frame_poses(config, table, poses, k, keyframe, [frame.tracks for frame in frames], camera)
+    T = np.concatenate([found, poses[k + 1 : k + 2]])
     measurements = [measurements_of(frame.preintegration) for frame in frames]
     return VisualInterval(T[:, :3, 3], T[:, :3, :3] @ T_cam_imu[:3, :3], measurements)
 

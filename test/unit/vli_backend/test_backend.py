@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from scene import Motion, Scan, calibration
+from scene import SHORT_NS, Motion, Scan, calibration
 
 from vli_backend.backend import BackEnd
 from vli_backend.config import BackEndConfig
@@ -75,8 +75,29 @@ def test_a_start_in_motion_tracks_within_a_second_and_a_half(start_s: float) -> 
     first = next(o for o in outputs if o.state is TrackingState.TRACKING)
     assert first.stamp_ns - outputs[0].stamp_ns < 1.5e9
     rmse, scale = _errors(scan, outputs, calibration())
-    assert rmse < 0.15
-    assert scale < 0.5
+    assert rmse < 0.03
+    assert scale < 0.3
+
+
+@pytest.mark.parametrize(("start_s", "speed"), [(0.0, 0.008), (0.4, 0.014), (0.8, 0.008), (2.4, 0.014)])
+def test_the_first_window_of_a_start_in_motion_knows_its_scale_and_has_all_frames(start_s: float, speed: float) -> None:
+    scan = Scan(Motion(rest_s=0.0, speed=speed), start_s=start_s, seed=int(start_s * 10))
+    _, outputs = _run(scan, 3.0)
+    window = next(o.window for o in outputs if o.window is not None)
+    truth = np.stack([scan.truth(stamp) for stamp in window.stamps])
+    _, scale = align(window.T_map_camera[:, :3, 3], truth[:, :3, 3], with_scale=True)
+    assert abs(1 / scale - 1) < 0.008
+    assert np.diff(window.stamps).max() < 1.1 * SHORT_NS
+
+
+def test_without_an_imu_a_window_that_begins_in_motion_begins_where_the_scanner_is() -> None:
+    scan = Scan(Motion(rest_s=0.0), with_imu=False)
+    cal = dataclasses.replace(calibration(), T_cam_imu=None, imu=None)
+    _, outputs = _run(scan, 1.0, Mode.VL, cal)
+    stamps, poses = _trajectory(outputs, cal)
+    truth = np.stack([scan.truth(stamp) for stamp in stamps[:2]])
+    step, true_step = (np.linalg.norm(T[1, :3, 3] - T[0, :3, 3]) for T in (poses, truth))
+    assert step == pytest.approx(true_step, rel=0.15)
 
 
 def test_the_scanner_works_without_an_imu() -> None:
