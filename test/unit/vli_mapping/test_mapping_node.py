@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -20,8 +21,9 @@ from vli_common.node import inputs
 from vli_common.status import Health, NodeState, StageStatus
 from vli_common.topics import IMAGE_LONG, LASER_POINTS, MAP, STATUS
 from vli_common.types import Counters, Image, LaserScan
-from vli_mapping.map_file import load_map
+from vli_mapping.map_file import load_map, save_map
 from vli_mapping.nodes.mapping_node import MappingNode
+from vli_mapping.snapshot import take
 
 BEHIND_S = 8
 LONG_HZ = 30
@@ -172,6 +174,15 @@ def test_the_map_of_a_session_that_ends_is_kept_whole_and_the_next_begins_empty(
     assert saving.close()
     assert len(load_map(kept)) == points
     assert files(tmp_path) == [kept.name]
+
+
+@pytest.mark.parametrize(("of", "left"), [(3, []), (4, ["auto.vli"])])
+def test_what_was_saved_of_a_session_that_ends_goes_and_what_is_of_the_next_stays(saving, tmp_path, of, left):
+    sheet(saving.mapper.map)
+    save_map(tmp_path / "auto.vli", replace(take(saving.mapper.map, None), origin=f"session {of} of backend_node 77"))
+    saving.on_session(Session(4, "the clock jumped"))
+    assert saving.close()
+    assert files(tmp_path) == [*left, "auto_session-3.vli"]
 
 
 def test_scans_of_the_window_that_ends_with_its_session_are_kept_too(saving, monkeypatch, tmp_path):

@@ -231,7 +231,7 @@ class MappingNode(VliNode):
         status = self.others.get(_BACK_END)
         if status is None or self._mapper is None or status.values.get("session") != str(self.session):
             return ""
-        return f"session {self.session} of {_BACK_END} {status.values.get('started_ns', '')}"
+        return f"{_origin_of(self.session)} {status.values.get('started_ns', '')}"
 
     def _look_after_autosave(self) -> None:
         """Resume a predecessor's map once it is known which is the present frame; from then on save when it is time.
@@ -293,8 +293,8 @@ class MappingNode(VliNode):
         waiting = mapper.waiting()
         if not waiting and (self._version == self._initial or not len(mapper.map)):
             return
-        path = self._path("autosave_path")
-        path = path.with_stem(f"{path.stem}_session-{mapper.session}")
+        number, autosave = mapper.session, self._path("autosave_path")
+        path = autosave.with_stem(f"{autosave.stem}_session-{number}")
         # The mapper goes on with a map in which there is nothing.
         whole = mapper.map if len(mapper.map) else PointMap(mapper.config.map)
         fit, photographs = mapper.light_fit(), mapper.photographs()
@@ -305,7 +305,10 @@ class MappingNode(VliNode):
             try:
                 save_map(path, view(whole, light))
                 self.get_logger().info(f"keeps the map of the session that has ended as '{path}'")
-            except VliError as error:
+                # Else it would pass for one of the session that begins.
+                if map_origin(autosave).startswith(_origin_of(number)):
+                    autosave.unlink()
+            except (VliError, OSError) as error:
                 self.get_logger().error(f"map of the session that has ended: {error}")
 
         self.do_aside(write)
@@ -349,6 +352,10 @@ class MappingNode(VliNode):
     def _clear(self) -> str:
         self.call(lambda: self.mapper.reset(self.session))
         return "the map is empty"
+
+
+def _origin_of(session: int) -> str:
+    return f"session {session} of {_BACK_END}"
 
 
 def _complete(
