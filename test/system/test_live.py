@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 import rclpy
+from patience import wait
 from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
@@ -22,6 +23,7 @@ from tiny_bag import TinyBag, write_calibration
 from vli_common.node import set_transport_profile
 from vli_common.types import NANOSECONDS
 from vli_driver.bag_file import McapFile, RawMessage
+from vli_mapping.map_file import load_map
 
 pytestmark = pytest.mark.graph
 
@@ -60,16 +62,26 @@ def publish(node: Node, messages: list[RawMessage], rate: float) -> None:
     time.sleep(2.0)
 
 
+def messages(bag: Path) -> list[RawMessage]:
+    """Return images and IMU of a recording."""
+    return list(McapFile(next(bag.glob("*.mcap"))).messages(set(NAMES)))
+
+
+def live(calibration: Path, out: Path, *options: str) -> subprocess.Popen[str]:
+    """Start the command."""
+    names = ["--topic", f"image={NAMES[IMAGES].removesuffix('/compressed')}", "--topic", f"imu={NAMES[IMU]}"]
+    command = [sys.executable, "-m", "vli_bringup.cli", "live", "--calib", str(calibration), "--out", str(out), *names, *options]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
 def scan(scanner: Node, bag: Path, calibration: Path, out: Path, rate: float = 1.0) -> tuple[int, str, str]:
     """Run the command on a recording that is published; return exit code, standard output and error."""
-    names = ["--topic", f"image={NAMES[IMAGES].removesuffix('/compressed')}", "--topic", f"imu={NAMES[IMU]}"]
-    command = [sys.executable, "-m", "vli_bringup.cli", "live", "--calib", str(calibration), "--out", str(out), *names]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process = live(calibration, out)
     killer = threading.Timer(_START_S, process.kill)
     killer.start()
     try:
         assert process.stderr.readline() == "vli live: ready; Ctrl-C ends the scan and writes the results\n"
-        publish(scanner, list(McapFile(next(bag.glob("*.mcap"))).messages(set(NAMES))), rate)
+        publish(scanner, messages(bag), rate)
         process.send_signal(signal.SIGINT)
         out_text, error_text = process.communicate(timeout=120)
         return process.returncode, out_text, error_text
@@ -105,3 +117,26 @@ def test_a_scan_that_is_ended_by_a_signal_has_everything_that_vli_run_writes(
     poses = len((tmp_path / "out" / "trajectory.tum").read_text().splitlines())
     assert poses == summary["frames_with_pose"] > 50
     assert len((tmp_path / "out" / "covariance.csv").read_text().splitlines()) == poses + 1
+
+
+def test_a_scan_whose_command_is_killed_leaves_its_map_and_the_next_does_not_take_its_place(
+    tmp_path: Path, scanner: Node, repository: Path
+) -> None:
+    demo, out = repository / "bags/demo", tmp_path / "out"
+    calibration, saved = demo / "calibration.yaml", tmp_path / "out.partial" / "autosave.vli"
+    process = live(calibration, out, "--autosave", "1")
+    try:
+        assert process.stderr is not None
+        assert process.stderr.readline().startswith("vli live: ready")
+        publish(scanner, messages(demo / "bag"), 0.5)
+        wait(saved.exists)
+    finally:
+        process.kill()
+        process.communicate()
+    wait(lambda: len(load_map(saved)) > 3000)
+    again = live(calibration, out)
+    assert again.wait(timeout=60.0) == 2
+    assert again.stderr is not None
+    told = again.stderr.read()
+    assert f"'{tmp_path / 'out.partial'}' holds what is left of a scan that was cut off (autosave.vli)" in told
+    assert saved.exists()
