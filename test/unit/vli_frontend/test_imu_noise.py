@@ -42,6 +42,14 @@ def test_noise_five_times_worse_is_found(tremor: float) -> None:
     assert found.gyroscope_random_walk == IMU.gyroscope_random_walk
 
 
+def test_short_intervals_of_a_fast_scanner_are_collected() -> None:
+    rng, monitor = np.random.default_rng(8), NoiseMonitor(IMU)
+    for index in range(40):
+        whole = segment(rng, 5.0, 0.33 * index, 0.3)
+        monitor.update(ImuSegment(whole.stamps[:21], whole.gyro[:21], whole.accel[:21], 5_000_000))
+    assert monitor.imu.gyroscope_noise_density == pytest.approx(5 * IMU.gyroscope_noise_density, rel=0.2)
+
+
 def test_a_shock_does_not_count_as_noise() -> None:
     rng, monitor = np.random.default_rng(5), NoiseMonitor(IMU)
     for index in range(20):
