@@ -13,6 +13,7 @@ from vli_common.types import LaserScan
 
 _LASER_SPREAD = 0.5
 _VISUAL_SPREAD = 3.0
+_FIRST_SPREAD = 2.0
 _ENOUGH = 5
 """Landmarks whose median says where others may be."""
 _REACH = 8.0
@@ -24,13 +25,15 @@ class DepthPrior:
     """Range of surfaces (m), a first depth (m), and one sigma of an inverse depth's first guess, relative.
 
     With the laser the guess is good and steadies a young landmark. Without it the guess is only what the window believes: it must
-    say next to nothing, or hundreds of landmarks together hold a wrong scale.
+    say next to nothing, or hundreds of landmarks together hold a wrong scale. So must the first one of all, which is the same for
+    all landmarks: it is the stripe's depth, and they may lie on something else.
     """
 
     near: float
     far: float
     first: float
     spread: float = _LASER_SPREAD
+    first_spread: float = _FIRST_SPREAD
 
     @property
     def inverse_limits(self) -> tuple[float, float]:
@@ -52,4 +55,4 @@ class DepthPrior:
 
     def around(self, median: float) -> DepthPrior:
         """Return the prior of a start from vision, whose landmarks lie at a median depth."""
-        return DepthPrior(min(self.near, median / _REACH), max(self.far, median * _REACH), median, _VISUAL_SPREAD)
+        return DepthPrior(min(self.near, median / _REACH), max(self.far, median * _REACH), median, _VISUAL_SPREAD, _VISUAL_SPREAD)

@@ -37,6 +37,10 @@ from vli_common.types import (
     WindowPoses,
 )
 
+_WIDE, _WIDE_ITERATIONS = 10.0, 5
+"""Times the width of the robust loss with which the first windows are solved before: where depths are guesses yet, and the scale
+with them, all that the laser says would be outliers."""
+
 
 @dataclass(frozen=True)
 class FrameResult:
@@ -199,7 +203,8 @@ class WindowEstimator:
         if scale_sigma is not None:
             self._smoother.hold_scale(1.0, scale_sigma)
         self._measure_depths(0)
-        covariance, _ = self._solve(self._config.start_iterations)
+        self._landmarks.widen(self._depths.first_spread)
+        covariance, _ = self._solve(is_first=True)
         self._records = [
             FrameRecord(self._window.stamps[-1], self._state.T_map_imu @ self._T_imu_cam, self._window.stationary[-1])
         ]
@@ -243,9 +248,11 @@ class WindowEstimator:
         self._candidate = tracks, state
         self._append_keyframe(tracks, state, imu)
         moving = not tracks.stationary
+        if moving and not self._moving_keyframes:
+            self._landmarks.widen(self._depths.first_spread)
         self._moving_keyframes += int(moving)
         first_ones = moving and self._moving_keyframes <= self._config.start_keyframes
-        covariance, problem = self._solve(self._config.start_iterations if first_ones else self._config.iterations)
+        covariance, problem = self._solve(first_ones)
         self._candidate = tracks, self._state
         self._tracker.set_keyframe(tracks.stamp_ns, self._state)
         T = self._state.T_map_imu
@@ -283,8 +290,11 @@ class WindowEstimator:
         scan = self._scans[-1] if self._scans else self._window.newest_scan
         return self._depths.guess(scan, self._landmarks.arrays.rho[self._landmarks.usable])
 
-    def _solve(self, iterations: int) -> tuple[FloatArray, str]:
+    def _solve(self, is_first: bool) -> tuple[FloatArray, str]:
         """Find depths, then poses, velocities and biases of the window.
+
+        Args:
+            is_first: the window is one of the first in motion.
 
         Returns:
             Covariance (6, 6) of the newest pose; why the solver failed at first, if it did: what it knew is kept.
@@ -292,8 +302,12 @@ class WindowEstimator:
         # The one before the newest lacked the scans after it.
         self._measure_depths(len(self._window) - 2)
         self._map = self.constraints
-        condenser, problem = self._condenser(self._landmarks.usable, range(len(self._window.intervals))), ""
+        use, intervals = self._landmarks.usable, range(len(self._window.intervals))
+        iterations = self._config.start_iterations if is_first else self._config.iterations
+        condenser, problem = self._condenser(use, intervals), ""
         try:
+            if is_first:
+                self._smoother.solve(self._condenser(use, intervals, _WIDE), _WIDE_ITERATIONS)
             self._smoother.solve(condenser, iterations)
             covariance = self._smoother.newest_covariance()
         except SmootherError as error:
@@ -306,17 +320,24 @@ class WindowEstimator:
         if jump is not None:
             raise SmootherError(f"the newest keyframe jumped by {jump:.3f} m")
         poses = self._keyframe_poses()
-        self._refine(poses, np.ones(len(self._landmarks), np.bool_))
+        self._refine(poses, np.ones(len(self._landmarks), np.bool_), self._config.cauchy)
         self._points = self._landmarks.points(poses)
         return covariance, problem
 
-    def _condenser(self, use: BoolArray, map_intervals: range) -> Condenser:
-        """Return what linearises the used landmarks, and the map constraints of the stripes in some of the intervals."""
+    def _condenser(self, use: BoolArray, map_intervals: range, width: float = 1.0) -> Condenser:
+        """Return what linearises the used landmarks, and the map constraints of the stripes in some of the intervals.
+
+        Args:
+            use: (L,), which landmarks.
+            map_intervals: of the window.
+            width: of the robust loss of landmarks, times that of the configuration.
+        """
+        cauchy = width * self._config.cauchy
 
         def linearise(T_map_imu: FloatArray) -> Quadratic:
             poses = T_map_imu @ self._T_imu_cam
-            self._refine(poses, use)
-            quadratic = condense(self._landmarks.arrays, poses, use, self._config.cauchy)
+            self._refine(poses, use, cauchy)
+            quadratic = condense(self._landmarks.arrays, poses, use, cauchy)
             if self._map is not None and len(self._map) and len(map_intervals):
                 quadratic = quadratic + condense_map(
                     self._map,
@@ -331,8 +352,8 @@ class WindowEstimator:
 
         return linearise
 
-    def _refine(self, poses: FloatArray, use: BoolArray) -> None:
-        information = refine(self._landmarks.arrays, poses, use, self._config.cauchy, self._limits)
+    def _refine(self, poses: FloatArray, use: BoolArray, cauchy: float) -> None:
+        information = refine(self._landmarks.arrays, poses, use, cauchy, self._limits)
         self._landmarks.information[use] = information[use]
 
     @property

@@ -119,6 +119,12 @@ class LandmarkTable:
         self.arrays.prior[rows, 0], self.arrays.prior[rows, 1] = 1.0 / depth, np.maximum(relative, _ADOPTED_SIGMA) / depth
         self.information[rows] = 0.0
 
+    def widen(self, spread: float) -> None:
+        """Let the guesses so far say less: one standard deviation, relative. What was adopted is no guess."""
+        prior = self.arrays.prior
+        is_guess = prior[:, 1] > 0.9 * self._spread * prior[:, 0]
+        prior[is_guess, 1] = np.maximum(prior[is_guess, 1], spread * prior[is_guess, 0])
+
     def set_depths(
         self, slot: int, rows: IntArray, inverse_depth: FloatArray, sigma: FloatArray, stripe_px: FloatArray, primary_only: bool
     ) -> None:

@@ -79,6 +79,7 @@ def structure_from_motion(
     measured = 0
     for _ in range(_ROUNDS):
         measured = _measure(table, config, tracks, poses, scans, focal)
+        poses = _to_scale(table, poses) if measured >= _MIN_DEPTHS else poses
         poses, _ = bundle_adjust(linearise, poses, config.start_iterations)
     if measured < _MIN_DEPTHS:
         return _failed(f"{measured} features near the stripe, {_MIN_DEPTHS} are needed")
@@ -132,6 +133,23 @@ def chain_keyframes(
         table.add_keyframe(track.ids, track.rays, white, np.zeros(len(track), np.bool_), guess)
         refine(table.arrays, np.stack(poses), table.usable, config.cauchy, limits)
     return np.stack(poses)
+
+
+def _to_scale(table: LandmarkTable, poses: FloatArray) -> FloatArray:
+    """Scale landmarks and poses (K, 4, 4) by the median of what the laser measured over what vision has; return the poses.
+
+    The adjustment would not find a scale that is far off: to its robust loss, all that the laser says would be outliers.
+    """
+    arrays = table.arrays
+    rows, slots = np.nonzero(arrays.depth_sigma > 0)
+    rays = np.concatenate([arrays.anchor_ray[rows], np.ones((len(rows), 1))], axis=1) / arrays.rho[rows, None]
+    anchors = poses[arrays.anchor[rows]]
+    points = np.einsum("nij,nj->ni", anchors[:, :3, :3], rays) + anchors[:, :3, 3]
+    depths = np.einsum("ni,ni->n", points - poses[slots, :3, 3], poses[slots, :3, 2])
+    factor = float(np.median(1.0 / (arrays.depth[rows, slots] * depths)))
+    arrays.rho /= factor
+    arrays.prior /= factor
+    return np.stack([pose(T[:3, :3], factor * T[:3, 3]) for T in poses])
 
 
 def frame_poses(

@@ -10,6 +10,7 @@ from scene import SHORT_NS, Motion, Scan, calibration
 
 from vli_backend.backend import BackEnd
 from vli_backend.config import BackEndConfig
+from vli_backend.depth_prior import DepthPrior
 from vli_common.arrays import FloatArray
 from vli_common.calibration import Calibration
 from vli_common.geometry import align, inverse, transform
@@ -88,6 +89,20 @@ def test_the_first_window_of_a_start_in_motion_knows_its_scale_and_has_all_frame
     _, scale = align(window.T_map_camera[:, :3, 3], truth[:, :3, 3], with_scale=True)
     assert abs(1 / scale - 1) < 0.008
     assert np.diff(window.stamps).max() < 1.1 * SHORT_NS
+
+
+@pytest.mark.parametrize("guess_m", [0.028, 0.044])
+def test_a_first_guess_of_depths_that_is_a_quarter_off_does_not_hold_the_scale(
+    monkeypatch: pytest.MonkeyPatch, guess_m: float
+) -> None:
+    """As where the stripe lies between the keys at rest, and the features on top of them."""
+    monkeypatch.setattr(DepthPrior, "guess", lambda *_: 1.0 / guess_m)
+    scan = Scan(seed=3)
+    _, outputs = _run(scan, 2.5)
+    stamps, poses = _trajectory(outputs, calibration())
+    truth = np.stack([scan.truth(stamp) for stamp in stamps])
+    shift, true_shift = ((inverse(T[0]) @ T)[:, :3, 3] for T in (poses, truth))
+    assert np.linalg.norm(shift - true_shift, axis=1).max() < 2e-4
 
 
 def test_without_an_imu_a_window_that_begins_in_motion_begins_where_the_scanner_is() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vli_backend.landmarks import KEPT_OBSERVATIONS, LandmarkTable
+from vli_backend.landmarks import KEPT_OBSERVATIONS, LandmarkPoints, LandmarkTable
 from vli_common.arrays import IntArray
 
 RHO = 30.0
@@ -42,6 +42,15 @@ def test_a_track_with_a_new_patch_becomes_a_new_landmark() -> None:
     assert list(table.ids) == [5, 5]
     assert list(table.active) == [False, True]
     assert table.arrays.anchor[1] == 3
+
+
+def test_guesses_can_be_made_to_say_less_and_what_was_adopted_stays() -> None:
+    table = LandmarkTable(9, spread=0.5)
+    _add(table, [1, 2])
+    known = LandmarkPoints(np.array([2]), np.array([[0.0, 0.0, 0.04]]), np.array([[0.0, 0.0, 4e-4]]))
+    table.adopt(known, np.eye(4), 0.01)
+    table.widen(2.0)
+    np.testing.assert_allclose(table.arrays.prior, [[RHO, 2.0 * RHO], [25.0, 0.25]])
 
 
 def test_the_primary_frame_is_the_one_nearest_to_the_stripe() -> None:
