@@ -13,7 +13,7 @@ RECORDING := ../shared/data/keyboard_short
 # Tests start ROS graphs of their own: they must not meet those of others on the network.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 
-.PHONY: demo test test-all lint format bench bench-estimator bench-goals bench-graph bench-calibration bench-scenes pictures calibration-pictures venv config lock clean
+.PHONY: demo test test-all lint format bench bench-estimator bench-goals bench-graph bench-calibration bench-random bench-scenes pictures calibration-pictures venv config lock clean
 
 demo: venv
 	$(BIN)/vli demo
@@ -52,7 +52,7 @@ format: venv
 	$(BIN)/ruff format .
 
 bench: venv
-	@for script in $(filter-out %/bench_estimator.py %/bench_graph.py,$(wildcard test/perf/bench_*.py)); do \
+	@for script in $(filter-out %/bench_estimator.py %/bench_graph.py %/bench_random.py,$(wildcard test/perf/bench_*.py)); do \
 		echo "== $$script"; \
 		test -d $(RECORDING) || { echo "skipped: needs the recording '$(RECORDING)'"; continue; }; \
 		$(BIN)/python $$script || failed=1; \
@@ -81,6 +81,11 @@ bench-calibration: venv
 # The pictures of docs/calibration.md.
 calibration-pictures: venv
 	$(BIN)/python docs/calibration_pictures.py docs/images
+
+# Forty random scenes, the usual ones and the hard ones; an hour and a half to make.
+bench-random: venv
+	$(BIN)/python test/perf/bench_random.py
+	$(BIN)/python test/perf/bench_random.py --ranges wide --first 8001
 
 bench-scenes: venv
 	$(BIN)/python test/perf/scenes.py
