@@ -15,7 +15,7 @@ from vli_backend.depth_prior import DepthPrior
 from vli_backend.frame_pose import FramePose
 from vli_backend.frame_tracker import FrameTracker
 from vli_backend.landmarks import LandmarkPoints, LandmarkTable
-from vli_backend.laser_depth import measure_slot
+from vli_backend.laser_depth import measure_keyframes
 from vli_backend.map_residuals import condense_map
 from vli_backend.plane_residuals import PlaneResiduals, plane_residuals
 from vli_backend.pose_covariance import PoseCovariance
@@ -378,20 +378,8 @@ class WindowEstimator:
 
     def _measure_depths(self, first: int) -> None:
         """Give the features of the keyframes from slot ``first`` on their laser depth, eq. (2)."""
-        poses, near_ns = self._keyframe_poses(), round(self._config.depth_window_s * 1e9)
-        for slot in range(max(0, first), len(self._window)):
-            stripes = self._window.near_scans(slot, poses, near_ns) or self._nearest_to_only_keyframe(poses[0], near_ns)
-            if stripes:
-                measure_slot(self._landmarks, slot, poses[slot], stripes, self._camera.focal_px, self._config)
-
-    def _nearest_to_only_keyframe(self, T_map_camera: FloatArray, near_ns: int) -> list[tuple[FloatArray, LaserScan]]:
-        """Return the pose of a window's only keyframe with the nearest stripe, as if taken there; at rest, any is."""
-        if len(self._window) > 1 or not self._scans:
-            return []
-        stamp_ns = self._window.stamps[0]
-        nearest = min(self._scans, key=lambda scan: abs(scan.stamp_ns - stamp_ns))
-        is_near = self._window.stationary[0] or abs(nearest.stamp_ns - stamp_ns) <= near_ns
-        return [(T_map_camera, nearest)] if is_near else []
+        focal = self._camera.focal_px
+        measure_keyframes(self._landmarks, self._window, self._keyframe_poses(), first, self._scans, focal, self._config)
 
     @property
     def _on_map(self) -> bool:

@@ -7,6 +7,7 @@ slope is held by a weak prior (surfaces tilted less than about 60°), which turn
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numba
@@ -14,6 +15,7 @@ import numpy as np
 
 from vli_backend.config import BackEndConfig
 from vli_backend.landmarks import LandmarkTable
+from vli_backend.window import Window
 from vli_common.arrays import FloatArray
 from vli_common.geometry import inverse, transform
 from vli_common.types import LaserScan
@@ -112,6 +114,38 @@ def laser_depths(
         rays = points[:, :2] / z[:, None]
         _fit(features, rays, 1.0 / z, (z * z / sigma) ** 2, radius_px / focal_px, min_points, max_rms, out)
     return LaserDepths(out[:, 0], out[:, 1], out[:, 2] * focal_px)
+
+
+def measure_keyframes(
+    table: LandmarkTable,
+    window: Window,
+    poses: FloatArray,
+    first: int,
+    waiting: Sequence[LaserScan],
+    focal_px: float,
+    config: BackEndConfig,
+) -> None:
+    """Give the features of the keyframes from slot ``first`` on the laser depths that the stripes around them tell.
+
+    Args:
+        table: of the landmarks; written.
+        window: of the keyframes and the scans between them.
+        poses: (K, 4, 4) of the keyframes.
+        first: slot.
+        waiting: scans since the newest keyframe. They serve where it is the only one: the nearest counts as taken there, if that
+            was at rest, or near in time.
+        focal_px: for pixels ⇄ rays.
+        config: parameters.
+    """
+    near_ns = round(config.depth_window_s * 1e9)
+    for slot in range(max(0, first), len(window)):
+        stripes = window.near_scans(slot, poses, near_ns)
+        if len(window) == 1 and waiting:
+            away_ns, nearest = min(((abs(scan.stamp_ns - window.stamps[0]), scan) for scan in waiting), key=lambda item: item[0])
+            if window.stationary[0] or away_ns <= near_ns:
+                stripes = [(poses[0], nearest)]
+        if stripes:
+            measure_slot(table, slot, poses[slot], stripes, focal_px, config)
 
 
 def measure_slot(

@@ -13,7 +13,7 @@ from vli_backend.config import BackEndConfig
 from vli_backend.frame_pose import solve_frame_pose
 from vli_backend.initialisation import bundle_adjust, chain_rotations
 from vli_backend.landmarks import LandmarkTable
-from vli_backend.laser_depth import measure_slot
+from vli_backend.laser_depth import measure_keyframes
 from vli_backend.track_noise import whitening
 from vli_backend.window import FrameRecord, Window, close_interval
 from vli_common.arrays import FloatArray
@@ -196,9 +196,5 @@ def _measure(
         window.append(track.stamp_ns, False, close_interval(pair, scans) if k else None)
     # Poses are rough yet: so are the depth planes.
     rough = dataclasses.replace(config, depth_max_rms=3 * config.depth_max_rms, primary_only=True)
-    for slot in range(len(tracks)):
-        stripes = window.near_scans(slot, poses, round(config.depth_window_s * 1e9))
-        if not stripes:
-            continue
-        measure_slot(table, slot, poses[slot], stripes, focal, rough)
+    measure_keyframes(table, window, poses, 0, [], focal, rough)
     return int(np.count_nonzero((table.arrays.depth_sigma > 0).any(axis=1)))

@@ -23,7 +23,7 @@ from vli_bringup.watch import GraphWatch
 from vli_common.calibration import Calibration
 from vli_common.status import NodeState
 from vli_common.types import Mode
-from vli_mapping.map_file import SUFFIX
+from vli_mapping.map_file import SUFFIX, session_of
 from vli_mapping.render import write_views
 from vli_mapping.store import write_ply
 
@@ -183,6 +183,7 @@ def run_graph(options: GraphOptions, directory: Path, started_s: float, follow: 
         # All is on the disk before the graph is left: what the middleware does then is not ours.
         earlier = sessions.write(directory)
         latencies.write(directory / "timing.csv")
+        _fall_back(directory, sessions.number)
         summary = {
             "frames_long": listener.value(_DEMUX, "stage.long"),
             "frames_short": listener.value(_DEMUX, "stage.short"),
@@ -205,7 +206,7 @@ def run_graph(options: GraphOptions, directory: Path, started_s: float, follow: 
             "nodes": {name: dict(sorted(status.values.items())) for name, status in sorted(listener.statuses.items())},
         }
         (directory / SUMMARY).write_text(json.dumps(summary, indent=1) + "\n")
-    _put_away_saves(directory, earlier, options.settings)
+    _put_away_saves(directory, sessions.number, earlier, options.settings)
     return summary
 
 
@@ -236,25 +237,33 @@ def report(summary: dict[str, Any], path: Path, command: str) -> int:
 
 
 def _write_map(directory: Path, settings: Settings) -> int:
-    """Write cloud and picture of the map that was saved, else of the last automatic save; return its points."""
-    if not (directory / _MAP).exists() and (directory / AUTOSAVE).exists():
-        (directory / AUTOSAVE).replace(directory / _MAP)
-    if not (directory / _MAP).exists():
+    """Write cloud and picture of the map in a directory; return its points."""
+    path = directory / _MAP
+    if not path.exists():
         return 0
-    cloud = read_map(directory / _MAP, settings.mapping.colour)
+    cloud = read_map(path, settings.mapping.colour)
     write_ply(directory / "map.ply", cloud)
     write_views(directory / "cloud.png", cloud)
     return len(cloud)
 
 
-def _put_away_saves(directory: Path, earlier: Mapping[int, Path], settings: Settings) -> None:
-    """Give earlier sessions the maps that mapping kept of them; what it has saved of the last one is in the map itself."""
-    autosave = directory / AUTOSAVE
-    for session, path in earlier.items():
-        kept = autosave.with_stem(f"{autosave.stem}_session-{session}")
-        if kept.exists():
-            kept.replace(path / _MAP)
+def _fall_back(directory: Path, session: int) -> None:
+    """Where the map was not saved in the end, take the last automatic save of this session, if not of an earlier one."""
+    path, save = directory / _MAP, directory / AUTOSAVE
+    if not path.exists() and save.exists() and session_of(save) in (session, None):
+        save.replace(path)
+
+
+def _put_away_saves(directory: Path, session: int, earlier: Mapping[int, Path], settings: Settings) -> None:
+    """Give earlier sessions the maps that mapping kept of them, else its last save; one of this session is in the map itself."""
+    save = directory / AUTOSAVE
+    for number, path in earlier.items():
+        kept = save.with_stem(f"{save.stem}_session-{number}")
+        if kept.exists() or session_of(save) == number:
+            (kept if kept.exists() else save).replace(path / _MAP)
             _write_map(path, settings)
     if not (directory / _MAP).exists():
+        _fall_back(directory, session)
         _write_map(directory, settings)
-    autosave.unlink(missing_ok=True)
+    elif session_of(save) == session:
+        save.unlink()

@@ -27,9 +27,14 @@ class GraphSessions:
         self._order: list[int] = []
 
     @property
+    def number(self) -> int:
+        """Of the present session."""
+        return self._order[-1] if self._order else 0
+
+    @property
     def recorder(self) -> Recorder:
         """Of the present session; its states are those of all."""
-        return self._of(self._order[-1] if self._order else 0)
+        return self._of(self.number)
 
     @property
     def poses(self) -> int:
@@ -52,6 +57,10 @@ class GraphSessions:
         if not self._order:
             return self.recorder
         return self._of(self._order[max(bisect(self._began_ns, published_ns) - 1, 0)])
+
+    def of_window(self, session: int, published_ns: int) -> Recorder:
+        """Return the recorder of a window, which says of what session it is; of an unknown one, see :meth:`at`."""
+        return self._of(session) if session in self._order else self.at(published_ns)
 
     def write(self, directory: Path) -> dict[int, Path]:
         """Write trajectories; return session → directory of the earlier ones in which something was tracked."""

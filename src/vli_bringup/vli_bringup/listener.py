@@ -204,7 +204,8 @@ class GraphListener:
 
     def _on_window(self, message: Any, info: dict[str, Any]) -> None:
         self._received.add(WINDOW.name)
-        self.sessions.at(int(info["source_timestamp"])).add([window_from_message(message)])
+        window = window_from_message(message)
+        self.sessions.of_window(window.session, int(info["source_timestamp"])).add([window])
 
     def _on_status(self, message: Any, info: dict[str, Any]) -> None:
         status = status_from_message(message)

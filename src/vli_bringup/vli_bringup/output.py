@@ -40,19 +40,12 @@ class ResultsDirectory(NewDirectory):
 
 
 class ScanDirectory(ResultsDirectory):
-    """The results of a scan that nobody can make again: what there is of one that was cut off stays in ``DIR.partial``.
+    """The results of a scan that nobody can make again: what there is of one that was cut off stays in ``DIR.partial``."""
 
-    Raises:
-        OutputError: as for any results; and where what is left of such a scan is in the way.
-    """
-
-    def __init__(self, out: Path | None, overwrite: bool = False) -> None:
-        super().__init__(out, overwrite)
-        if not overwrite and (left := self._left()):
-            raise OutputError(
-                f"'{self.partial}' holds what is left of a scan that was cut off ({left}); rename it, choose another with "
-                "--out DIR, or replace it with --overwrite"
-            )
+    def rest(self) -> str:
+        """Tell of maps and trajectories of a scan that was cut off."""
+        left = self._left()
+        return f"what is left of a scan that was cut off ({left})" if left else ""
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         """Move what was written into place; where something failed, leave what there is of the scan, and say so."""

@@ -18,10 +18,12 @@ class NewDirectory:
         overwrite: True lets it be replaced.
 
     Raises:
-        OutputError: the directory holds something already, is none, or cannot be made.
+        OutputError: the directory holds something already, is none, or cannot be made; or ``DIR.partial`` holds what must not be
+            lost.
     """
 
     def __init__(self, path: Path, marker: str, overwrite: bool = False) -> None:
+        self._marker = marker
         if path.name in ("", ".."):
             raise OutputError(f"'{path}' is no name for a new directory; choose another with --out DIR")
         self.path, self.partial = path, path.with_name(path.name + ".partial")
@@ -29,6 +31,14 @@ class NewDirectory:
             _check(path, marker, overwrite)
         except OSError as error:
             raise OutputError(f"'{path}' cannot be looked at ({error.strerror}); choose another with --out DIR") from error
+        if not overwrite and (rest := self.rest()):
+            raise OutputError(
+                f"'{self.partial}' holds {rest}; rename it, choose another with --out DIR, or replace it with --overwrite"
+            )
+
+    def rest(self) -> str:
+        """Return what ``DIR.partial`` holds that nobody can make again, in words; empty where that is nothing."""
+        return ""
 
     def __enter__(self) -> Path:
         """Return the directory to write to."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import tokenize
 import zipfile
 from collections.abc import Iterator
@@ -107,6 +108,21 @@ def map_origin(path: Path) -> str:
         return ""
     with _reading(path) as archive:
         return _origin(_read_header(path, archive))
+
+
+def session_origin(session: int, back_end: str) -> str:
+    """Return the origin of a map that was made in a session of a back end."""
+    return f"session {session} of {back_end}"
+
+
+def session_of(path: Path) -> int | None:
+    """Return the session of which :func:`session_origin` named the map; None where there is no such map.
+
+    Raises:
+        InputError: a map that cannot be read.
+    """
+    found = re.match(r"session (\d+) of ", map_origin(path))
+    return int(found[1]) if found else None
 
 
 def is_map(path: Path) -> bool:

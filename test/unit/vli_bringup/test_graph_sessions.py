@@ -69,3 +69,12 @@ def test_poses_that_come_before_any_status_are_recorded(sessions: GraphSessions)
     sessions.at(500).add_pose(10, at(0.1))
     sessions.begin(0, 600)
     assert list(sessions.recorder.live) == [10]
+
+
+def test_the_last_window_of_a_session_belongs_to_it_even_where_the_next_was_told_before(sessions: GraphSessions) -> None:
+    sessions.begin(1, 1000)
+    first = sessions.recorder
+    sessions.begin(2, 2000)
+    assert sessions.of_window(1, 2100) is first
+    assert sessions.of_window(2, 2200) is sessions.recorder
+    assert sessions.of_window(10**12, 2300) is sessions.recorder

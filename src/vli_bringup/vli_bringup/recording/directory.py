@@ -6,7 +6,7 @@ from pathlib import Path
 from types import TracebackType
 
 from vli_common.directories import NewDirectory
-from vli_common.errors import OutputError, VliError
+from vli_common.errors import VliError
 
 
 class RecordingDirectory(NewDirectory):
@@ -21,13 +21,12 @@ class RecordingDirectory(NewDirectory):
     """
 
     def __init__(self, out: Path, overwrite: bool) -> None:
-        marker = f"{out.name}_0.mcap"
-        super().__init__(out, marker, overwrite)
-        if not overwrite and (self.partial / marker).exists():
-            raise OutputError(
-                f"'{self.partial}' holds a recording that was cut off, which every command reads as it is; rename it, choose "
-                "another with --out DIR, or replace it with --overwrite"
-            )
+        super().__init__(out, f"{out.name}_0.mcap", overwrite)
+
+    def rest(self) -> str:
+        """Tell of a recording that was cut off."""
+        is_there = (self.partial / self._marker).exists()
+        return "a recording that was cut off, which every command reads as it is" if is_there else ""
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         """Give the recording its name; one that is known to hold nothing is removed, one that something broke stays as it is."""

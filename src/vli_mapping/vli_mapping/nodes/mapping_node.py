@@ -32,7 +32,7 @@ from vli_mapping.albedo import finished_cloud
 from vli_mapping.config import AS_SEEN, MappingConfig
 from vli_mapping.export import write_cloud
 from vli_mapping.light import Light
-from vli_mapping.map_file import SUFFIX, load_map, map_origin, save_map
+from vli_mapping.map_file import SUFFIX, load_map, map_origin, save_map, session_of, session_origin
 from vli_mapping.mapper import Mapper
 from vli_mapping.mesh import make_mesh, write_mesh
 from vli_mapping.photographs import Photograph, develop
@@ -231,7 +231,7 @@ class MappingNode(VliNode):
         status = self.others.get(_BACK_END)
         if status is None or self._mapper is None or status.values.get("session") != str(self.session):
             return ""
-        return f"{_origin_of(self.session)} {status.values.get('started_ns', '')}"
+        return session_origin(self.session, f"{_BACK_END} {status.values.get('started_ns', '')}")
 
     def _look_after_autosave(self) -> None:
         """Resume a predecessor's map once it is known which is the present frame; from then on save when it is time.
@@ -267,10 +267,12 @@ class MappingNode(VliNode):
         self._autosaved_s = time.monotonic()
         path = self._path("autosave_path")
         try:
-            version = self.call(self._settled_version)
+            version, origin = self.call(self._settled_version), self._origin
             snapshot = self._snapshot(path)
-            save_map(path, replace(snapshot, origin=self._origin))
-            self._saved = version
+            # A session that ends meanwhile has its map kept; it must not be saved as the next one's.
+            if self._origin == origin:
+                save_map(path, replace(snapshot, origin=origin))
+                self._saved = version
         except VliError as error:
             self.get_logger().error(f"automatic save: {error}", throttle_duration_sec=60.0)
         finally:
@@ -306,7 +308,7 @@ class MappingNode(VliNode):
                 save_map(path, view(whole, light))
                 self.get_logger().info(f"keeps the map of the session that has ended as '{path}'")
                 # Else it would pass for one of the session that begins.
-                if map_origin(autosave).startswith(_origin_of(number)):
+                if session_of(autosave) == number:
                     autosave.unlink()
             except (VliError, OSError) as error:
                 self.get_logger().error(f"map of the session that has ended: {error}")
@@ -352,10 +354,6 @@ class MappingNode(VliNode):
     def _clear(self) -> str:
         self.call(lambda: self.mapper.reset(self.session))
         return "the map is empty"
-
-
-def _origin_of(session: int) -> str:
-    return f"session {session} of {_BACK_END}"
 
 
 def _complete(
