@@ -93,3 +93,13 @@ def test_f13_a_clock_that_jumps_costs_neither_path_nor_map_of_before(demo: Path,
         assert len(read_tum(path / "trajectory_final.tum")) > 20
         assert len(ply.read_cloud(path / "map.ply").points) > 3000
         assert len(load_map(path / "map.vli")) > 3000
+
+
+def test_a_replay_of_half_a_bag_says_what_was_lost(demo: Path, tmp_path: Path) -> None:
+    whole = next((demo / "bag").glob("*.mcap")).read_bytes()
+    half = tmp_path / "half.mcap"
+    half.write_bytes(whole[: len(whole) // 3])
+    process = replay(demo, tmp_path / "out", bag=half)
+    _, told = process.communicate(timeout=START_S)
+    assert process.returncode in (0, 1), told.decode()
+    assert sum("warning" in line and "half.mcap" in line for line in told.decode().splitlines()) == 1

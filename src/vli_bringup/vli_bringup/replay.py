@@ -50,7 +50,8 @@ def run(args: argparse.Namespace) -> int:
     results = ResultsDirectory(args.out, args.overwrite)
     with results as directory:
         summary = run_graph(options, directory, args.started_s, _play)
-    for warning in warnings:
+    of_bag = summary["nodes"].get(SCANNER, {}).get("bag_warnings")
+    for warning in [*warnings, *([of_bag] if of_bag else [])]:
         print(f"vli replay: warning: {warning}", file=sys.stderr)
     return report(summary, results.path, "replay")
 

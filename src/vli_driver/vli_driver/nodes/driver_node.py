@@ -39,6 +39,7 @@ class DriverNode(VliNode):
         self._playback = self.parameters.config(PlaybackConfig)
         self._player = self._make_player()
         self._thread: threading.Thread | None = None
+        self._bag_warnings = ""
         for topic in (CALIBRATION, IMAGE_RAW, IMAGE_RAW_COMPRESSED, EXPOSURE, IMU):
             self.advertise(topic)
 
@@ -76,6 +77,8 @@ class DriverNode(VliNode):
         late = self._player.counters["late"]
         hint = f"{late} items were late: the machine does not keep the pace of the bag" if late else ""
         values = {"position_ns": str(self._player.position_ns)}
+        if self._bag_warnings:
+            values["bag_warnings"] = self._bag_warnings
         if self._player.due is not None:
             values |= dict(zip(("due_stamp_ns", "due_wall_ns"), map(str, self._player.due), strict=True))
         return Health.WARN if late else Health.OK, hint, values
@@ -119,6 +122,7 @@ class DriverNode(VliNode):
             self._begin_session(f"bag '{reader.path.name}'", 0)
             if not self._player.play(reader):
                 return
+            self._bag_warnings = "; ".join(reader.warnings)
             for warning in reader.warnings:
                 self.get_logger().warning(warning)
             self.set_state(NodeState.FINISHED)
