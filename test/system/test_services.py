@@ -12,7 +12,7 @@ from vli_bringup.listener import GraphListener
 from vli_bringup.processes import NodeProcesses
 from vli_common.calibration import load_calibration
 from vli_common.status import NodeState
-from vli_mapping.map_file import load_map
+from vli_mapping.map_file import load_map, session_of
 
 pytestmark = pytest.mark.graph
 
@@ -60,6 +60,9 @@ def test_services_of_a_running_scan(repository: Path, tmp_path: Path, parameter_
         assert listener.call(f"{_MAPPING}/load", _ANSWER_S).startswith(f"{count} points from '{saved}'")
         wait(listener, lambda: listener.value(_MAPPING, "points") >= count)
 
-        assert len(load_map(autosaved)) > 0
+        kept = autosaved.with_stem(f"{autosaved.stem}_session-{session}")
+        wait(listener, kept.exists, processes=processes)
+        wait(listener, lambda: (session_of(autosaved) or 0) > session, processes=processes)
+        assert min(len(load_map(kept)), len(load_map(autosaved))) > 0
         wait(listener, lambda: text(listener, _BACK_END, "tracking") == "TRACKING", processes=processes)
         assert processes.restarts == {}

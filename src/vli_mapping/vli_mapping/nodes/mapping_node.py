@@ -270,7 +270,7 @@ class MappingNode(VliNode):
             version, origin = self.call(self._settled_version), self._origin
             snapshot = self._snapshot(path)
             # A session that ends meanwhile has its map kept; it must not be saved as the next one's.
-            if self._origin == origin:
+            if self._origin == origin and self.session == version[0]:
                 save_map(path, replace(snapshot, origin=origin))
                 self._saved = version
         except VliError as error:
@@ -308,8 +308,9 @@ class MappingNode(VliNode):
                 save_map(path, view(whole, light))
                 self.get_logger().info(f"keeps the map of the session that has ended as '{path}'")
                 # Else it would pass for one of the session that begins.
-                if session_of(autosave) == number:
-                    autosave.unlink()
+                with self._saving:
+                    if session_of(autosave) == number:
+                        autosave.unlink()
             except (VliError, OSError) as error:
                 self.get_logger().error(f"map of the session that has ended: {error}")
 
