@@ -20,6 +20,7 @@ from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import CompressedImage, Imu
 from tiny_bag import TinyBag, write_calibration
 
+from vli_bringup.tum import read_tum
 from vli_common.node import set_transport_profile
 from vli_common.types import NANOSECONDS
 from vli_driver.bag_file import McapFile, RawMessage
@@ -119,24 +120,28 @@ def test_a_scan_that_is_ended_by_a_signal_has_everything_that_vli_run_writes(
     assert len((tmp_path / "out" / "covariance.csv").read_text().splitlines()) == poses + 1
 
 
-def test_a_scan_whose_command_is_killed_leaves_its_map_and_the_next_does_not_take_its_place(
+def test_a_scan_whose_command_is_killed_leaves_map_and_path_and_the_next_does_not_take_its_place(
     tmp_path: Path, scanner: Node, repository: Path
 ) -> None:
     demo, out = repository / "bags/demo", tmp_path / "out"
     calibration, saved = demo / "calibration.yaml", tmp_path / "out.partial" / "autosave.vli"
+    path = saved.with_suffix(".tum")
     process = live(calibration, out, "--autosave", "1")
     try:
         assert process.stderr is not None
         assert process.stderr.readline().startswith("vli live: ready")
         publish(scanner, messages(demo / "bag"), 0.5)
         wait(saved.exists)
+        wait(path.exists)
+        wait(lambda: len(path.read_text().splitlines()) > 10)
     finally:
         process.kill()
         process.communicate()
     wait(lambda: len(load_map(saved)) > 3000)
+    assert len(read_tum(path)) > 10
     again = live(calibration, out)
     assert again.wait(timeout=60.0) == 2
     assert again.stderr is not None
     told = again.stderr.read()
-    assert f"'{tmp_path / 'out.partial'}' holds what is left of a scan that was cut off (autosave.vli)" in told
+    assert f"'{tmp_path / 'out.partial'}' holds what is left of a scan that was cut off (autosave.tum, autosave.vli)" in told
     assert saved.exists()

@@ -60,7 +60,7 @@ def add_autosave_argument(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         type=_seconds,
         default=AUTOSAVE_S,
-        help="save the map every S seconds, to go on with it after a crash; 0: never (default: %(default)g)",
+        help="save map and path every S seconds, for what crashes; 0: never (default: %(default)g)",
     )
 
 

@@ -16,6 +16,7 @@ from vli_bringup.graph import AUTOSAVE, AUTOSAVE_S, STAGES, Playback, describe_g
 from vli_bringup.latency import FrameLatencies
 from vli_bringup.listener import LISTENER, GraphListener
 from vli_bringup.output import CONFIG, SUMMARY
+from vli_bringup.path_saves import PathSaves
 from vli_bringup.processes import GraphError, NodeProcesses
 from vli_bringup.settings import Settings, to_yaml
 from vli_bringup.stopping import stop_on_signals
@@ -47,7 +48,8 @@ class GraphOptions:
         settings: of all stages.
         mode: which sensors take part.
         playback: the bag; None for a sensor that is there.
-        autosave_s: seconds between automatic saves of the map, with which a mapping node that has crashed goes on; 0: never.
+        autosave_s: seconds between automatic saves of the map, with which a mapping node that has crashed goes on, and of the
+            path; 0: never.
     """
 
     calibration_path: Path
@@ -66,15 +68,16 @@ class RunningGraph:
         processes: of the nodes.
         listener: that hears them.
         stop: set once the run shall end.
+        saves: keep the path meanwhile.
     """
 
-    def __init__(self, processes: NodeProcesses, listener: GraphListener, stop: threading.Event) -> None:
+    def __init__(self, processes: NodeProcesses, listener: GraphListener, stop: threading.Event, saves: PathSaves) -> None:
         self.listener, self.stop = listener, stop
         self.begin_s: float | None = None
         """When data began (``time.perf_counter()``)."""
         self.data_s = 0.0
         """Seconds of data so far."""
-        self._processes, self._watch = processes, GraphWatch(processes)
+        self._processes, self._watch, self._saves = processes, GraphWatch(processes), saves
 
     def begin(self) -> float:
         """Note that data begin now; return when that is."""
@@ -90,6 +93,7 @@ class RunningGraph:
         self._processes.check()
         self.listener.spin()
         self._watch.look(self.listener.statuses, self.listener.heard_s)
+        self._saves.look()
 
     def wait_until(self, is_ready: Callable[[], bool], blamed: str) -> None:
         """Return when ``is_ready`` says so.
@@ -174,7 +178,9 @@ def run_graph(options: GraphOptions, directory: Path, started_s: float, follow: 
         NodeProcesses(nodes, directory / CONFIG) as processes,
         GraphListener(options.calibration, latencies) as listener,
     ):
-        graph, sessions = RunningGraph(processes, listener, stop), listener.sessions
+        sessions = listener.sessions
+        saves = PathSaves(sessions, directory, options.autosave_s)
+        graph = RunningGraph(processes, listener, stop, saves)
         failure = graph.follow(follow)
         now_s = time.perf_counter()
         begin_s = graph.begin_s or now_s
@@ -182,6 +188,7 @@ def run_graph(options: GraphOptions, directory: Path, started_s: float, follow: 
         problems = graph.hand_over(is_cut_short=stop.is_set() or bool(failure))
         # All is on the disk before the graph is left: what the middleware does then is not ours.
         earlier = sessions.write(directory)
+        saves.remove()
         latencies.write(directory / "timing.csv")
         _fall_back(directory, sessions.number)
         summary = {
