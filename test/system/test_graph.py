@@ -179,8 +179,8 @@ def test_a_bag_that_is_played_again_and_again_loses_nothing_between_its_end_and_
 
     listener.node.create_subscription(message_type(STATUS), STATUS.name, note, quality(STATUS, reading=True))
     with NodeProcesses(looped, parameter_file) as processes:
-        wait(listener, lambda: listener.value("mapping_node", "session") == 3, processes=processes)
-    assert finished == {(name, session) for name in NODES for session in "12"}
+        wait(listener, lambda: listener.value("mapping_node", "session") >= 3, processes=processes)
+    assert finished >= {(name, session) for name in NODES for session in "12"}
     assert "node.dropped_by_session" not in {
         key for status in listener.statuses.values() for key, value in status.values.items() if value != "0"
     }
