@@ -63,7 +63,10 @@ def test_a_back_end_that_crashes_costs_neither_path_nor_map_of_before(demo: Path
     with GraphListener(load_calibration(demo / "calibration.yaml")) as listener:
         wait(listener, lambda: listener.value(_MAPPING, "points") > 3000)
         session = listener.value(_BACK_END, "session")
-        os.kill(pid_of(process, _BACK_END), signal.SIGKILL)
+        pid = pid_of(process, _BACK_END)
+        # 0 is this process and its children.
+        assert pid
+        os.kill(pid, signal.SIGKILL)
         wait(listener, lambda: listener.value(_MAPPING, "session") > session and listener.value(_MAPPING, "points") > 500)
     said, told = process.communicate(timeout=START_S)
     errors = told.decode()

@@ -34,6 +34,8 @@ from vli_common.topics import STATUS
 
 pytestmark = pytest.mark.graph
 
+_ANSWER_S = 60.0
+
 
 @pytest.fixture
 def calibration(tmp_path: Path) -> Path:
@@ -52,7 +54,7 @@ def test_every_node_started_singly_stops_cleanly_on_a_signal(listener: GraphList
     processes = {name: subprocess.Popen(command(name, "use_sim_time:=true"), stderr=subprocess.PIPE) for name in NODES}
     try:
         wait(listener, lambda: set(NODES) <= set(listener.statuses))
-        assert listener.state("frontend_node") is NodeState.WAITING
+        wait(listener, lambda: listener.state("frontend_node") is NodeState.WAITING)
         assert "calibration_file" in listener.statuses["frontend_node"].hint
         for process in processes.values():
             process.send_signal(sign)
@@ -151,14 +153,14 @@ def test_a_reset_begins_a_new_session_in_every_node(
         wait(listener, lambda: all(listener.state(name) is NodeState.READY for name in NODES))
         processes.check()
         for number, name in enumerate(["mapping_node", "demux_node"], start=1):
-            assert listener.call(f"{name}/reset", 10.0) == f"session {number}"
-            wait(listener, lambda number=number: all(listener.value(node, "session") == number for node in NODES), 10.0)
-        listener.call("frontend_node/pause", 10.0)
-        wait(listener, lambda: listener.state("frontend_node") is NodeState.PAUSED, 10.0)
-        listener.call("frontend_node/resume", 10.0)
-        wait(listener, lambda: listener.state("frontend_node") is NodeState.READY, 10.0)
+            assert listener.call(f"{name}/reset", _ANSWER_S) == f"session {number}"
+            wait(listener, lambda number=number: all(listener.value(node, "session") == number for node in NODES))
+        listener.call("frontend_node/pause", _ANSWER_S)
+        wait(listener, lambda: listener.state("frontend_node") is NodeState.PAUSED)
+        listener.call("frontend_node/resume", _ANSWER_S)
+        wait(listener, lambda: listener.state("frontend_node") is NodeState.READY)
         with pytest.raises(GraphError, match="the map is empty"):
-            listener.call("mapping_node/save", 10.0)
+            listener.call("mapping_node/save", _ANSWER_S)
         pids = processes.pids
     assert not any(Path(f"/proc/{pid}").exists() for pid in pids.values())
 
@@ -179,8 +181,9 @@ def test_a_bag_that_is_played_again_and_again_loses_nothing_between_its_end_and_
 
     listener.node.create_subscription(message_type(STATUS), STATUS.name, note, quality(STATUS, reading=True))
     with NodeProcesses(looped, parameter_file) as processes:
+        wanted = {(name, session) for name in NODES for session in "12"}
+        wait(listener, lambda: finished >= wanted, processes=processes)
         wait(listener, lambda: listener.value("mapping_node", "session") >= 3, processes=processes)
-    assert finished >= {(name, session) for name in NODES for session in "12"}
     assert "node.dropped_by_session" not in {
         key for status in listener.statuses.values() for key, value in status.values.items() if value != "0"
     }
@@ -195,16 +198,17 @@ def is_running(pid: int | str) -> bool:
 
 
 def killed(processes: NodeProcesses, name: str) -> None:
-    """Kill a node and see that it is gone."""
+    """Kill a node; return once its end is known."""
     os.kill(processes.pids[name], signal.SIGKILL)
-    while is_running(processes.pids[name]):
+    while processes.is_running(name):
         time.sleep(0.01)
 
 
 def test_what_plays_a_bag_is_not_started_again_and_no_node_is_left_behind(
     tmp_path: Path, calibration: Path, parameter_file: Path
 ) -> None:
-    nodes = describe_graph(calibration, playback=Playback(tmp_path / "none"))
+    # Nobody of that name ever listens: the driver waits with the bag until it is killed.
+    nodes = describe_graph(calibration, playback=Playback(TinyBag().write(tmp_path / "bag")), audience=LISTENER)
     with NodeProcesses(nodes, parameter_file) as processes:
         pids = processes.pids
         killed(processes, "driver_node")
@@ -261,7 +265,7 @@ def test_the_doctor_listens_to_a_running_sensor(tmp_path: Path, calibration: Pat
     assert main(["doctor", "--live", "--duration", "1"]) == 1
     assert "nobody publishes '/imu'" in capsys.readouterr().out
     bag = TinyBag(seconds=40.0).write(tmp_path / "bag")
-    driver = subprocess.Popen(command("driver_node", f"bag:={bag}"))
+    driver = subprocess.Popen(command("driver_node", f"bag:={bag}", "loop:=true"))
     try:
         deadline_s = time.monotonic() + START_S
         out = ""

@@ -46,15 +46,21 @@ def scanner() -> Iterator[Node]:
 
 
 def publish(node: Node, messages: list[RawMessage], rate: float) -> None:
-    """Publish as a camera does, best effort, at the pace of the recording; wait until somebody listens."""
+    """Publish as a camera does, best effort, at the pace of the recording; wait until everybody listens.
+
+    The nodes find out once a second that the camera is best effort, and hear it as such from then on.
+    """
     kinds = {IMAGES: CompressedImage, IMU: Imu}
     publishers = {topic: node.create_publisher(kinds[topic], name, qos_profile_sensor_data) for topic, name in NAMES.items()}
-    deadline_s = time.monotonic() + _START_S
-    while not all(item.get_subscription_count() for item in publishers.values()):
-        assert time.monotonic() < deadline_s
-        time.sleep(0.05)
-    # The nodes find out once a second that the camera is best effort, and hear it as such from then on.
-    time.sleep(3.0)
+
+    def are_heard() -> bool:
+        for name, publisher in zip(NAMES.values(), publishers.values(), strict=True):
+            readers = node.get_subscriptions_info_by_topic(name)
+            if not readers or publisher.get_subscription_count() < len(readers):
+                return False
+        return True
+
+    wait(are_heard, _START_S)
     begin_s = time.monotonic()
     for message in messages:
         due_s = begin_s + (message.log_ns - messages[0].log_ns) / NANOSECONDS / rate

