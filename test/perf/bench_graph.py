@@ -35,11 +35,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from graph_bench import NODES, Graph, Meter, Recording, graph, live, resident_mb, rmse_mm, run_offline
+from graph_bench import NODES, Graph, Meter, PlayedSessions, Recording, graph, live, resident_mb, rmse_mm, run_offline
 
 from vli_bringup.cli import main as vli
 from vli_bringup.graph import describe_graph
 from vli_bringup.listener import GraphListener
+from vli_bringup.losses import left_out
 from vli_bringup.processes import GraphError
 from vli_bringup.tum import read_tum
 from vli_common.arrays import FloatArray
@@ -186,19 +187,20 @@ class Bench:
         memory: list[tuple[float, dict[str, float]]] = []
         with self.graph(loop=True) as run:
             run.wait_for_frames()
-            meter = Meter(run.listener)
+            meter, sessions = Meter(run.listener), PlayedSessions(run.listener)
             pids, begin_s = run.processes.pids, time.monotonic()
             while (now_s := time.monotonic()) < begin_s + 60.0 * minutes:
                 memory.append((now_s - begin_s, {name: resident_mb(pid) for name, pid in pids.items()}))
                 run.wait(lambda until_s=now_s + 2.0: time.monotonic() > until_s)  # type: ignore[misc]
             half_s = begin_s + 30.0 * minutes
             first, second = meter.latencies_ms(until_s=half_s), meter.latencies_ms(half_s)
-            losses, restarts = run.listener.losses(), run.processes.restarts
+            losses = sessions.undelivered() + left_out(list(run.listener.statuses.values()))
+            played, restarts = len(sessions.complete), run.processes.restarts
         for name in NODES:
             self._growth(name, memory, lambda sample, name=name: sample[name])
         self._growth("all nodes", memory, lambda sample: sum(sample.values()))
         self.table.add(f"{minutes:g} min: p99, first half → second", "flat", f"{_p99(first):.0f} → {_p99(second):.0f} ms")
-        self.table.add("losses, crashes", "0", f"{_losses(losses)}, {sum(restarts.values())}")
+        self.table.add(f"lost in {played} times the bag, crashes", "0", f"{_losses(losses)}, {sum(restarts.values())}")
 
     def stop(self) -> None:
         """Start and stop all nodes at random moments."""

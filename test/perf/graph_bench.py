@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import struct
 import time
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -15,6 +16,7 @@ import numpy as np
 
 from vli_bringup.graph import SCANNER, NodeDescription, Playback, describe_graph
 from vli_bringup.listener import LISTENER, GraphListener
+from vli_bringup.losses import undelivered
 from vli_bringup.pipeline import Pipeline, Stages
 from vli_bringup.processes import GraphError, NodeProcesses
 from vli_bringup.recorder import Recorder
@@ -25,9 +27,20 @@ from vli_bringup.warm_up import warm_up
 from vli_bringup.watch import GraphWatch
 from vli_common.arrays import FloatArray
 from vli_common.calibration import Calibration, load_calibration
+from vli_common.messages import status_from_message
 from vli_common.node.transport import message_type, quality
-from vli_common.status import NodeState
-from vli_common.topics import IMAGE_RAW, IMAGE_RAW_COMPRESSED, POSE, Topic
+from vli_common.status import NodeState, StageStatus
+from vli_common.topics import (
+    BIAS,
+    IMAGE_RAW,
+    IMAGE_RAW_COMPRESSED,
+    MAP_CONSTRAINTS,
+    ODOMETRY,
+    POSE,
+    RELOCALISATION,
+    STATUS,
+    Topic,
+)
 from vli_common.types import NANOSECONDS, EncodedImage, Mode
 from vli_driver.bag import BagReader, BagTopics
 from vli_driver.decode import decode
@@ -37,6 +50,7 @@ MAPPING = "mapping_node"
 _START_S = 300.0
 _STAMP = struct.Struct("<iI")
 _CDR_HEADER = 4
+_FEEDBACK = {topic.name for topic in (BIAS, ODOMETRY, MAP_CONSTRAINTS, RELOCALISATION)}
 _PAGE = os.sysconf("SC_PAGE_SIZE")
 
 
@@ -95,6 +109,36 @@ class Meter:
             take(seconds * NANOSECONDS + nanoseconds, time.monotonic())
 
         listener.node.create_subscription(message_type(topic), topic.name, note, quality(topic, reading=True), raw=True)
+
+
+class PlayedSessions:
+    """What each node said as it finished a session of a bag that is played again and again.
+
+    Args:
+        listener: in the graph.
+    """
+
+    def __init__(self, listener: GraphListener) -> None:
+        self._finished: dict[str, dict[str, StageStatus]] = defaultdict(dict)
+        listener.node.create_subscription(message_type(STATUS), STATUS.name, self._note, quality(STATUS, reading=True))
+
+    @property
+    def complete(self) -> list[list[StageStatus]]:
+        """The statuses of all nodes, of each session that all have finished."""
+        return [list(statuses.values()) for statuses in self._finished.values() if set(statuses) == set(NODES)]
+
+    def undelivered(self) -> Counter[str]:
+        """Return ``node.topic`` → messages that did not reach a node.
+
+        Feedback that comes after a node has finished is none of these.
+        """
+        lost = sum((undelivered(statuses) for statuses in self.complete), Counter[str]())
+        return Counter({name: count for name, count in lost.items() if name.partition(".")[2] not in _FEEDBACK})
+
+    def _note(self, message: Any) -> None:
+        status = status_from_message(message)
+        if status.state is NodeState.FINISHED:
+            self._finished[status.values["session"]][status.node] = status
 
 
 @dataclass

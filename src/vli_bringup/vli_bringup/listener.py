@@ -18,6 +18,7 @@ from std_srvs.srv import Trigger
 from vli_bringup.graph import SCANNER, STAGES
 from vli_bringup.graph_sessions import GraphSessions
 from vli_bringup.latency import FrameLatencies
+from vli_bringup.losses import count_of, left_out, undelivered
 from vli_bringup.processes import GraphError
 from vli_bringup.recorder import Recorder
 from vli_common.arrays import FloatArray
@@ -34,7 +35,7 @@ from vli_common.messages import (
 )
 from vli_common.node.transport import message_type, quality, set_transport_profile
 from vli_common.status import Health, NodeState, StageStatus
-from vli_common.topics import BIAS, NAMESPACE, ODOMETRY, POSE, STATUS, WINDOW, Topic
+from vli_common.topics import NAMESPACE, ODOMETRY, POSE, STATUS, WINDOW, Topic
 from vli_common.types import Counters, TrackingState
 
 LISTENER = "replay"
@@ -112,19 +113,10 @@ class GraphListener:
         Lost on the way (sent by one node, not received by the next), dropped by an overloaded node, malformed, of another
         session, or too early; feedback (``bias``), of which only the newest matters, does not count.
         """
-        values = [item for status in self.statuses.values() for item in status.values.items()]
-        sent = {key[5:]: count_of(value) for key, value in values if key[:5] == "sent."}
-        lost: dict[str, int] = {}
-        for node, status in sorted(self.statuses.items()):
-            for key, value in status.values.items():
-                kind, _, name = key.partition(".")
-                if name == BIAS.name or kind not in ("received", "dropped", "node"):
-                    continue
-                count = sent.get(name, 0) - count_of(value) if kind == "received" else count_of(value)
-                if count > 0:
-                    lost[f"{node}.{name}"] = lost.get(f"{node}.{name}", 0) + count
-        missed = {f"{LISTENER}.{topic.name}": sent.get(topic.name, 0) - self._received[topic.name] for topic in _RECORDED}
-        return lost | {name: count for name, count in missed.items() if count > 0}
+        received = {f"received.{topic.name}": str(self._received[topic.name]) for topic in _RECORDED}
+        own = StageStatus(time.time_ns(), LISTENER, Health.OK, NodeState.READY, "", received)
+        statuses = list(self.statuses.values())
+        return dict(undelivered([*statuses, own]) + left_out(statuses))
 
     def call(self, service: str, timeout_s: float, is_there: Callable[[], bool] = lambda: True) -> str:
         """Call ``node/service`` (std_srvs/Trigger) and return its answer.
@@ -219,11 +211,3 @@ class GraphListener:
             self.sessions.begin(count_of(values.get("session", "0")), int(info["source_timestamp"]))
         if status.node == _BACK_END and "tracking" in values:
             self.sessions.recorder.add_state(int(values["stamp_ns"]), TrackingState(values["tracking"]), values["reason"])
-
-
-def count_of(text: str) -> int:
-    """Return a whole number out of a status, zero where there is none."""
-    try:
-        return int(float(text))
-    except (ValueError, OverflowError):
-        return 0

@@ -11,7 +11,7 @@ from collections import defaultdict
 from collections.abc import Mapping
 from typing import Protocol
 
-from vli_bringup.listener import count_of
+from vli_bringup.losses import count_of
 from vli_common.reception import Reception
 from vli_common.status import NodeState, StageStatus
 
