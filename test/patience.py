@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 PATIENCE_S = 20.0
 _STEP_S = 0.01
@@ -15,3 +16,11 @@ def wait(condition: Callable[[], object], timeout_s: float = PATIENCE_S) -> None
     while not condition():
         assert time.monotonic() < end_s
         time.sleep(_STEP_S)
+
+
+def is_running(pid: int | str) -> bool:
+    """Return False for a process that has ended, whether or not somebody has taken note."""
+    try:
+        return "State:\tZ" not in Path(f"/proc/{pid}/status").read_text()
+    except OSError:
+        return False

@@ -17,6 +17,7 @@ import pytest
 from graph_tools import NODES, START_S, command, wait
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
+from patience import is_running
 from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import Imu
 from tiny_bag import TinyBag, write_calibration
@@ -187,14 +188,6 @@ def test_a_bag_that_is_played_again_and_again_loses_nothing_between_its_end_and_
     assert "node.dropped_by_session" not in {
         key for status in listener.statuses.values() for key, value in status.values.items() if value != "0"
     }
-
-
-def is_running(pid: int | str) -> bool:
-    """Return False for a process that has ended, whether or not somebody has taken note."""
-    try:
-        return "State:\tZ" not in Path(f"/proc/{pid}/status").read_text()
-    except OSError:
-        return False
 
 
 def killed(processes: NodeProcesses, name: str) -> None:

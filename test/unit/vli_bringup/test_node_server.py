@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from patience import is_running
 
 from vli_bringup.graph import NodeDescription
 from vli_bringup.node_server import load, threads
@@ -54,14 +55,6 @@ def wait_for(process: ServedProcess, server: NodeServer) -> None:
         assert server.failure is None, server.failure
         assert time.monotonic() < deadline_s
         server.listen(0.1)
-
-
-def is_running(pid: int) -> bool:
-    """Return False for a process that has ended, whether or not somebody has taken note."""
-    try:
-        return "State:\tZ" not in Path(f"/proc/{pid}/status").read_text()
-    except OSError:
-        return False
 
 
 @pytest.fixture
